@@ -1,0 +1,1 @@
+"""What things are: the models of every input, parameter and product."""

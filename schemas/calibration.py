@@ -1,0 +1,140 @@
+"""calibration.yaml: the camera, the two laser sheets and the mount (FORMATS, "calibration.yaml")."""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from .base import Model
+
+Vector = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class Port(Model):
+    """A flat window square to the optical axis, in metres from the centre of projection."""
+
+    distance: Annotated[float, Field(ge=0, le=1, description="centre of projection to inner face, metres")]
+    thickness: Annotated[float, Field(ge=0, le=0.2, description="metres")]
+    glass_index: Annotated[float, Field(ge=1, le=2.5)] = 1.49
+    water_index: Annotated[float, Field(ge=1, le=1.6)] = 1.34
+
+
+class Camera(Model):
+    """Interior orientation. Pixel centres at integer coordinates; brown and fisheye as OpenCV defines them."""
+
+    model: Literal["brown", "fisheye", "flat-port"]
+    width: Annotated[int, Field(gt=0, le=100_000, description="pixels")]
+    height: Annotated[int, Field(gt=0, le=100_000, description="pixels")]
+    fx: Annotated[float, Field(gt=0, description="pixels")]
+    fy: Annotated[float, Field(gt=0, description="pixels")]
+    cx: Annotated[float, Field(description="pixels")]
+    cy: Annotated[float, Field(description="pixels")]
+    distortion: Annotated[tuple[float, ...], Field(description="k1 k2 p1 p2 [k3], or fisheye k1 k2 k3 k4")] = ()
+    port: Port | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Camera":
+        allowed = {"brown": (0, 4, 5), "flat-port": (0, 4, 5), "fisheye": (0, 4)}[self.model]
+        if len(self.distortion) not in allowed:
+            raise ValueError(
+                f"{self.model} takes {' or '.join(map(str, allowed))} distortion coefficients, "
+                f"found {len(self.distortion)}"
+            )
+        if (self.port is not None) != (self.model == "flat-port"):
+            raise ValueError("a flat-port camera needs a port, and only a flat-port camera has one")
+        return self
+
+
+class LaserPlane(Model):
+    """A sheet of light: normal . X = offset, camera frame, metres."""
+
+    name: Annotated[str, Field(min_length=1)]
+    normal: Vector
+    offset: float
+
+    @model_validator(mode="after")
+    def _unit_normal(self) -> "LaserPlane":
+        length = math.sqrt(sum(v * v for v in self.normal))
+        if abs(length - 1) > 1e-3:
+            raise ValueError(f"the normal of plane {self.name} has length {length:.6g}, not 1")
+        if abs(self.normal[1]) < 1e-6:
+            raise ValueError(f"plane {self.name} is seen along the image's columns: it crosses no image row")
+        return self
+
+
+class CrossGeometry(Model):
+    """The paper's parametrisation (III.A): baseline d along camera +x, tilt alpha, roll of the cross."""
+
+    baseline: Annotated[float, Field(gt=0, description="d, metres along camera x")]
+    angle: Annotated[float, Field(gt=0, lt=90, description="alpha, degrees from the camera axis")]
+    roll: Annotated[float, Field(ge=-180, le=180, description="degrees; 45 in the paper")] = 45.0
+
+
+class Laser(Model):
+    """The projected cross: two sheets, given as planes or by the cross's geometry."""
+
+    wavelength_nm: Annotated[float, Field(ge=380, le=800)] = 532.0
+    origin: Annotated[Vector, Field(description="emitter, camera frame, metres")]
+    planes: tuple[LaserPlane, LaserPlane] | CrossGeometry
+
+    @property
+    def sheets(self) -> tuple[LaserPlane, LaserPlane]:
+        """The two sheets as planes, however they were given."""
+        if isinstance(self.planes, CrossGeometry):
+            return _sheets(self.planes)
+        return self.planes
+
+    @model_validator(mode="after")
+    def _two_directions(self) -> "Laser":
+        slopes = [-plane.normal[0] / plane.normal[1] for plane in self.sheets]
+        if slopes[0] * slopes[1] >= 0:
+            raise ValueError("the two planes must image one rising and one falling arm (a cross, paper III.A)")
+        return self
+
+
+def _sheets(geometry: CrossGeometry) -> tuple[LaserPlane, LaserPlane]:
+    """Planes of a cross aimed from (d, 0, 0) at the optical axis under alpha: X ± Y/cos(alpha) + Z tan(alpha) = d
+    for a roll of 45 degrees."""
+    alpha, roll = math.radians(geometry.angle), math.radians(geometry.roll)
+    # The laser's own axes in the camera frame: its optical axis leans towards -x.
+    axis_x = (math.cos(alpha), 0.0, math.sin(alpha))
+    axis_y = (0.0, 1.0, 0.0)
+
+    def plane(name: str, angle: float) -> LaserPlane:
+        cosine, sine = math.cos(angle), math.sin(angle)
+        nx, ny, nz = (cosine * axis_x[k] + sine * axis_y[k] for k in range(3))
+        return LaserPlane(name=name, normal=(nx, ny, nz), offset=nx * geometry.baseline)
+
+    return plane("a", -roll), plane("b", math.pi / 2 - roll)
+
+
+class Mount(Model):
+    """The camera in the vehicle: metres, and roll, pitch, yaw in degrees relative to the zero mount."""
+
+    translation: Vector = (0.0, 0.0, 0.0)
+    rotation: Vector = (0.0, 0.0, 0.0)
+
+
+class CovarianceBlock(Model):
+    """Covariance of named calibration parameters, in the order given."""
+
+    parameters: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+
+    @model_validator(mode="after")
+    def _square(self) -> "CovarianceBlock":
+        size = len(self.parameters)
+        if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
+            raise ValueError(f"expected a {size} x {size} matrix for {size} parameters")
+        return self
+
+
+class Calibration(Model):
+    """A calibration.yaml."""
+
+    format: Literal[1]
+    camera: Camera
+    laser: Laser | None = None
+    mount: Mount = Mount()
+    covariance: tuple[CovarianceBlock, ...] = ()

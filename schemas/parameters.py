@@ -1,0 +1,107 @@
+"""What can be chosen: one model per stage, each field with its default, unit and bounds.
+
+Every step of the pipeline is stored under a digest of the stage models that it reads, so a change here
+recomputes what depends on it and nothing else.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from .base import Model
+
+
+class LaserParameters(Model):
+    """Laser point detection, segmentation and triangulation (paper III.B, III.C, III.D)."""
+
+    intensity_sigmas: Annotated[
+        float, Field(ge=0.5, le=20, description="green threshold: standard deviations above the mean")
+    ] = 3.0
+    curvature_sigmas: Annotated[
+        float, Field(ge=1, le=20, description="second derivative threshold: standard deviations below zero")
+    ] = 5.0
+    range_min_m: Annotated[float, Field(gt=0, description="nearest believable sounding, metres")] = 0.5
+    range_max_m: Annotated[float, Field(gt=0, description="farthest believable sounding, metres")] = 8.0
+    histogram_bin_m: Annotated[float, Field(gt=0, le=1, description="paper III.D: 0.1 m")] = 0.1
+    histogram_min_share: Annotated[
+        float, Field(ge=0, le=0.5, description="a depth bin with a smaller share of an arm's points is rejected")
+    ] = 0.01
+
+
+class FeatureParameters(Model):
+    """SIFT features (paper III.E)."""
+
+    max_features: Annotated[int, Field(ge=100, le=50_000)] = 4000
+    max_pixels: Annotated[
+        int, Field(ge=100_000, description="images are halved until they have no more pixels than this")
+    ] = 3_000_000
+    contrast_threshold: Annotated[float, Field(gt=0, le=0.2)] = 0.01
+
+
+class MatchParameters(Model):
+    """Pairs of images and their relative motion (paper III.E)."""
+
+    ratio: Annotated[float, Field(gt=0.4, lt=1, description="Lowe's ratio test")] = 0.8
+    min_inliers: Annotated[int, Field(ge=8, description="matches that agree, for a pair to count")] = 15
+    inlier_px: Annotated[float, Field(gt=0, le=20, description="RANSAC distance, pixels at full resolution")] = 3.0
+    min_overlap: Annotated[
+        float, Field(ge=0, lt=1, description="share of a footprint, from navigation, for a pair to be tried")
+    ] = 0.05
+    max_pairs_per_image: Annotated[int, Field(ge=1, le=100)] = 12
+    planarity_m: Annotated[
+        float, Field(gt=0, description="laser points of a pair within this of one plane: homography; else essential")
+    ] = 0.02
+    planar_share: Annotated[float, Field(gt=0.5, le=1, description="share of laser points on the plane")] = 0.9
+
+
+class AdjustParameters(Model):
+    """The global estimate that holds the chain of motions to navigation (paper IV)."""
+
+    robust_threshold: Annotated[float, Field(gt=0, description="Huber, in sigmas, on pair motions")] = 1.5
+    drift_m_per_sqrt_s: Annotated[
+        float, Field(gt=0, description="random walk of dead reckoning, metres per root second")
+    ] = 0.02
+
+
+class GridParameters(Model):
+    """Gridded bathymetry."""
+
+    cell_m: Annotated[
+        Annotated[float, Field(gt=0)] | Literal["auto"], Field(description="metres; auto: max(0.02, 4 GSD)")
+    ] = "auto"
+    max_interpolation_m: Annotated[
+        float, Field(ge=0, le=50, description="cells farther than this from any sounding stay empty, metres")
+    ] = 1.0
+    tile_cells: Annotated[int, Field(ge=64, le=8192)] = 512
+
+
+class MosaicParameters(Model):
+    """Orthomosaic and planar mosaic."""
+
+    cell_m: Annotated[
+        Annotated[float, Field(gt=0)] | Literal["auto"], Field(description="metres; auto: max(0.002, GSD)")
+    ] = "auto"
+    tile_cells: Annotated[int, Field(ge=256, le=16384)] = 2048
+    laser_halfwidth_px: Annotated[float, Field(ge=1, le=100, description="erased each side of the laser")] = 8.0
+    colour: Annotated[
+        Literal["flatfield", "none"], Field(description="flatfield: the mission's mean lighting is removed")
+    ] = "flatfield"
+
+
+class MeshParameters(Model):
+    """Textured surface."""
+
+    max_triangles: Annotated[int, Field(ge=100, le=20_000_000)] = 400_000
+    texture_px: Annotated[int, Field(ge=256, le=16384, description="longest side of the texture")] = 4096
+
+
+class Parameters(Model):
+    """All stages; `seamosaic run --params FILE --set grid.cell_m=0.05`."""
+
+    laser: LaserParameters = LaserParameters()
+    features: FeatureParameters = FeatureParameters()
+    match: MatchParameters = MatchParameters()
+    adjust: AdjustParameters = AdjustParameters()
+    grid: GridParameters = GridParameters()
+    mosaic: MosaicParameters = MosaicParameters()
+    mesh: MeshParameters = MeshParameters()

@@ -1,0 +1,1 @@
+"""How it runs: Dask graphs, clusters, the command line, the report."""
