@@ -3,9 +3,10 @@
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from .base import Model
+from .problems import inconsistent
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
@@ -37,12 +38,19 @@ class Camera(Model):
     def _consistent(self) -> "Camera":
         allowed = {"brown": (0, 4, 5), "flat-port": (0, 4, 5), "fisheye": (0, 4)}[self.model]
         if len(self.distortion) not in allowed:
-            raise ValueError(
-                f"{self.model} takes {' or '.join(map(str, allowed))} distortion coefficients, "
-                f"found {len(self.distortion)}"
+            raise inconsistent(
+                "distortion",
+                f"{len(self.distortion)} coefficients",
+                f"{' or '.join(map(str, allowed))} for the model {self.model}",
+                "Give k1 k2 k3 k4." if self.model == "fisheye" else "Give k1 k2 p1 p2 k3, as OpenCV orders them.",
             )
-        if (self.port is not None) != (self.model == "flat-port"):
-            raise ValueError("a flat-port camera needs a port, and only a flat-port camera has one")
+        if self.model == "flat-port" and self.port is None:
+            raise inconsistent(
+                "port", "nothing", "the window of a flat-port camera", "Add port: {distance, thickness}."
+            )
+        if self.model != "flat-port" and self.port is not None:
+            remedy = "Remove port, or set model: flat-port if the camera was calibrated in air."
+            raise inconsistent("port", "a window", f"none for the model {self.model}", remedy)
         return self
 
 
@@ -57,9 +65,15 @@ class LaserPlane(Model):
     def _unit_normal(self) -> "LaserPlane":
         length = math.sqrt(sum(v * v for v in self.normal))
         if abs(length - 1) > 1e-3:
-            raise ValueError(f"the normal of plane {self.name} has length {length:.6g}, not 1")
+            remedy = "Divide normal and offset by that length."
+            raise inconsistent("normal", f"a vector of length {length:.6g}", "a vector of length 1", remedy)
         if abs(self.normal[1]) < 1e-6:
-            raise ValueError(f"plane {self.name} is seen along the image's columns: it crosses no image row")
+            raise inconsistent(
+                "normal",
+                "a sheet along the image's columns",
+                "a sheet that crosses the image's rows at one point each",
+                "Check the order of the components: x right, y down in the image, z along the optical axis.",
+            )
         return self
 
 
@@ -71,12 +85,22 @@ class CrossGeometry(Model):
     roll: Annotated[float, Field(ge=-180, le=180, description="degrees; 45 in the paper")] = 45.0
 
 
+def _how_given(planes: object) -> str | None:
+    """Which of the two ways of giving the sheets is meant, so that an error speaks of that one only."""
+    if isinstance(planes, dict | CrossGeometry):
+        return "geometry"
+    return "planes" if isinstance(planes, list | tuple) else None
+
+
 class Laser(Model):
     """The projected cross: two sheets, given as planes or by the cross's geometry."""
 
     wavelength_nm: Annotated[float, Field(ge=380, le=800)] = 532.0
     origin: Annotated[Vector, Field(description="emitter, camera frame, metres")]
-    planes: tuple[LaserPlane, LaserPlane] | CrossGeometry
+    planes: Annotated[
+        Annotated[tuple[LaserPlane, LaserPlane], Tag("planes")] | Annotated[CrossGeometry, Tag("geometry")],
+        Discriminator(_how_given),
+    ]
 
     @property
     def sheets(self) -> tuple[LaserPlane, LaserPlane]:
@@ -89,7 +113,12 @@ class Laser(Model):
     def _two_directions(self) -> "Laser":
         slopes = [-plane.normal[0] / plane.normal[1] for plane in self.sheets]
         if slopes[0] * slopes[1] >= 0:
-            raise ValueError("the two planes must image one rising and one falling arm (a cross, paper III.A)")
+            raise inconsistent(
+                "planes",
+                "two sheets that lean the same way in the image",
+                "one rising and one falling arm (a cross, paper III.A)",
+                "Check the signs of the normals; roll of a cross is about 45 degrees.",
+            )
         return self
 
 
@@ -126,7 +155,8 @@ class CovarianceBlock(Model):
     def _square(self) -> "CovarianceBlock":
         size = len(self.parameters)
         if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
-            raise ValueError(f"expected a {size} x {size} matrix for {size} parameters")
+            remedy = "Give one row and one column a parameter."
+            raise inconsistent("matrix", f"{len(self.matrix)} rows", f"{size} x {size} numbers", remedy)
         return self
 
 

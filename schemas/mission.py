@@ -2,17 +2,31 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from .base import Model
+from .problems import inconsistent
+from .timestamps import check_pattern
 
+
+def _inside(path: str) -> str:
+    """A path that stays in the mission folder, so that the folder can be moved, zipped or put in a bucket."""
+    if "\\" in path:
+        raise inconsistent("", repr(path), "forward slashes", f"Write {path.replace(chr(92), '/')!r}.")
+    if path.startswith("/") or ":" in path.split("/")[0] or ".." in path.split("/"):
+        remedy = "Copy the file into the mission folder and give its path from there."
+        raise inconsistent("", repr(path), "a path inside the mission folder", remedy)
+    return path
+
+
+RelativePath = Annotated[str, Field(min_length=1), AfterValidator(_inside)]
 Role = Literal["combined", "texture", "laser"]
 
 
 class ImageSet(Model):
     """Images of one kind: laser and texture in one image, texture only, or laser only."""
 
-    path: Annotated[str, Field(min_length=1, description="glob relative to the mission folder")]
+    path: Annotated[RelativePath, Field(description="glob relative to the mission folder")]
     role: Role
 
 
@@ -20,7 +34,9 @@ class FilenameTimestamps(Model):
     """Time of exposure, found anywhere in the file's stem by a strptime pattern. UTC."""
 
     from_: Annotated[Literal["filename"], Field(alias="from")]
-    pattern: Annotated[str, Field(min_length=2)]
+    pattern: Annotated[
+        str, AfterValidator(check_pattern), Field(description="strptime pattern, e.g. %Y%m%dT%H%M%S.%fZ")
+    ]
 
 
 class ExifTimestamps(Model):
@@ -33,7 +49,7 @@ class CsvTimestamps(Model):
     """Time of exposure from a table with columns image,time."""
 
     from_: Annotated[Literal["csv"], Field(alias="from")]
-    path: Annotated[str, Field(min_length=1)]
+    path: RelativePath
 
 
 Timestamps = Annotated[FilenameTimestamps | ExifTimestamps | CsvTimestamps, Field(discriminator="from_")]
@@ -52,8 +68,8 @@ class NavigationSigma(Model):
 class NavigationSource(Model):
     """Where the navigation is and how good it is."""
 
-    path: Annotated[str, Field(min_length=1)]
-    time_offset: Annotated[float, Field(description="seconds added to navigation times")] = 0.0
+    path: RelativePath
+    time_offset: Annotated[float, Field(ge=-1e6, le=1e6, description="seconds added to navigation times")] = 0.0
     sigma: NavigationSigma = NavigationSigma()
 
 
@@ -72,20 +88,21 @@ class Mission(Model):
     """A mission.yaml."""
 
     format: Literal[1]
-    id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
+    id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", max_length=200, description="e.g. vortex-2026-06-03-a")]
     title: str = ""
     platform: str = ""
     images: Annotated[tuple[ImageSet, ...], Field(min_length=1)]
     timestamps: Timestamps
-    calibration: str = "calibration.yaml"
+    calibration: RelativePath = "calibration.yaml"
     navigation: NavigationSource | None = None
     crs: Annotated[str | None, Field(description="projected CRS, e.g. EPSG:32631")] = None
     vertical_datum: Annotated[str | None, Field(description="vertical CRS, e.g. EPSG:5714")] = None
-    tide: Annotated[str | None, Field(description="table with columns time,height (metres)")] = None
+    tide: Annotated[RelativePath | None, Field(description="table with columns time,height (metres)")] = None
     reporting: Reporting | None = None
 
     @model_validator(mode="after")
     def _tide_needs_navigation(self) -> "Mission":
         if self.tide is not None and self.navigation is None:
-            raise ValueError("a tide is given but no navigation whose depths it could correct")
+            remedy = "Add navigation, or remove tide."
+            raise inconsistent("tide", repr(self.tide), "a tide only where navigation gives depths", remedy)
         return self

@@ -6,9 +6,10 @@ recomputes what depends on it and nothing else.
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from .base import Model
+from .problems import inconsistent
 
 
 class LaserParameters(Model):
@@ -20,12 +21,29 @@ class LaserParameters(Model):
     curvature_sigmas: Annotated[
         float, Field(ge=1, le=20, description="second derivative threshold: standard deviations below zero")
     ] = 5.0
+    chain_min_points: Annotated[
+        int, Field(ge=1, le=1000, description="a line with fewer points, from row to row, is an orphan")
+    ] = 6
+    colour_share: Annotated[
+        float,
+        Field(ge=0, le=10, description="blue and red on a line, as a share of what white light would add, at most"),
+    ] = 0.55
+    min_soundings: Annotated[
+        int, Field(ge=1, le=10_000, description="an image with fewer has no laser, but something that looks like it")
+    ] = 60
     range_min_m: Annotated[float, Field(gt=0, description="nearest believable sounding, metres")] = 0.5
     range_max_m: Annotated[float, Field(gt=0, description="farthest believable sounding, metres")] = 8.0
     histogram_bin_m: Annotated[float, Field(gt=0, le=1, description="paper III.D: 0.1 m")] = 0.1
     histogram_min_share: Annotated[
         float, Field(ge=0, le=0.5, description="a depth bin with a smaller share of an arm's points is rejected")
     ] = 0.01
+
+    @model_validator(mode="after")
+    def _range_not_empty(self) -> "LaserParameters":
+        if self.range_min_m >= self.range_max_m:
+            expected, remedy = f"less than range_max_m, {self.range_max_m:g}", "Swap or correct the two."
+            raise inconsistent("range_min_m", f"{self.range_min_m:g}", expected, remedy)
+        return self
 
 
 class FeatureParameters(Model):
@@ -70,8 +88,9 @@ class GridParameters(Model):
         Annotated[float, Field(gt=0)] | Literal["auto"], Field(description="metres; auto: max(0.02, 4 GSD)")
     ] = "auto"
     max_interpolation_m: Annotated[
-        float, Field(ge=0, le=50, description="cells farther than this from any sounding stay empty, metres")
-    ] = 1.0
+        Annotated[float, Field(ge=0, le=50)] | Literal["auto"],
+        Field(description="cells farther than this from any sounding stay empty, metres; auto: max(1, range / 3)"),
+    ] = "auto"
     tile_cells: Annotated[int, Field(ge=64, le=8192)] = 512
 
 
@@ -82,7 +101,6 @@ class MosaicParameters(Model):
         Annotated[float, Field(gt=0)] | Literal["auto"], Field(description="metres; auto: max(0.002, GSD)")
     ] = "auto"
     tile_cells: Annotated[int, Field(ge=256, le=16384)] = 2048
-    laser_halfwidth_px: Annotated[float, Field(ge=1, le=100, description="erased each side of the laser")] = 8.0
     colour: Annotated[
         Literal["flatfield", "none"], Field(description="flatfield: the mission's mean lighting is removed")
     ] = "flatfield"

@@ -13,8 +13,6 @@ from typing import NamedTuple
 import numpy as np
 import pyproj
 from numpy.typing import NDArray
-from pyproj.aoi import AreaOfInterest
-from pyproj.database import query_utm_crs_info
 
 from .rotations import nearest_rotation
 
@@ -98,12 +96,3 @@ class MapFrame:
     def R_map_local(self, X_map: Array) -> Array:
         """Rotation (3, 3) from local axes to map axes at one map point: the meridian convergence, mostly."""
         return nearest_rotation(self.affine_at(X_map).matrix.T)
-
-
-def utm_crs(latitude: float, longitude: float) -> str:
-    """The WGS 84 UTM zone of a place, as EPSG code (Norway's and Svalbard's exceptions included)."""
-    info = query_utm_crs_info(
-        datum_name="WGS 84",
-        area_of_interest=AreaOfInterest(longitude, latitude, longitude, latitude),
-    )
-    return f"{info[0].auth_name}:{info[0].code}"

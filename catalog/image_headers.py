@@ -1,0 +1,117 @@
+"""What the first and last bytes of an image file tell: format, size, EXIF time, and whether the end is there."""
+
+import io
+from typing import BinaryIO, NamedTuple
+
+from .tiff_directory import Directory, exif_fields, first_directory
+
+# EXIF (at most 64 KiB) and colour profiles come before the size of a JPEG.
+HEADER_BYTES = 256 * 1024
+# Cameras put padding and thumbnails behind the end marker.
+TAIL_BYTES = 64 * 1024
+
+_START_OF_FRAME = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
+_TIME, _SUBSECONDS, _OFFSET = 0x9003, 0x9291, 0x9011
+_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
+_TIFF_STRIPS = ((273, 279), (324, 325))
+
+
+class Header(NamedTuple):
+    """What a file is.
+
+    Attributes
+    ----------
+    width, height : pixels as stored, EXIF rotation ignored; 0 where unreadable.
+    exif_time : EXIF DateTimeOriginal with sub-seconds and offset, in ISO 8601; empty if it has none.
+    fault : why it is no complete image; empty if it is one.
+    """
+
+    width: int
+    height: int
+    exif_time: str
+    fault: str
+
+
+def read_header(head: bytes, tail: bytes, whole: BinaryIO) -> Header:
+    """Read a header.
+
+    Parameters
+    ----------
+    head, tail : first and last bytes of the file (HEADER_BYTES and TAIL_BYTES, or the whole of a smaller one).
+    whole : the file, open, for TIFF.
+    """
+    if not head:
+        return Header(0, 0, "", "file is empty")
+    if head[:2] == b"\xff\xd8":
+        return _jpeg(head, tail)
+    if head[:8] == b"\x89PNG\r\n\x1a\n":
+        return _png(head, tail)
+    if head[:4] in (b"II*\0", b"MM\0*"):
+        return _tiff(whole)
+    return Header(0, 0, "", "not a JPEG, PNG or TIFF image")
+
+
+def _jpeg(head: bytes, tail: bytes) -> Header:
+    width, height, exif, position = 0, 0, b"", 2
+    while position + 4 <= len(head) and head[position] == 0xFF:
+        marker, length = head[position + 1], int.from_bytes(head[position + 2 : position + 4], "big")
+        if marker == 0xFF:  # padding
+            position += 1
+            continue
+        body = head[position + 4 : position + 2 + length]
+        if marker in _START_OF_FRAME and len(body) >= 5:
+            height, width = int.from_bytes(body[1:3], "big"), int.from_bytes(body[3:5], "big")
+        if marker == 0xE1 and body[:6] == b"Exif\0\0":
+            exif = exif or body[6:]
+        position += 2 + length
+        if marker == 0xDA:
+            break
+    if not width:
+        return Header(0, 0, "", "file is truncated or damaged (no JPEG frame header)")
+    # In the compressed data a 0xff is always followed by a zero; a thumbnail in the header has an end of its own.
+    body = head[position:] if len(head) < HEADER_BYTES else tail
+    fault = "" if b"\xff\xd9" in body else "file is truncated (no JPEG end marker)"
+    return Header(width, height, _exif_time(io.BytesIO(exif)), fault)
+
+
+def _png(head: bytes, tail: bytes) -> Header:
+    if len(head) < 33 or head[12:16] != b"IHDR":
+        return Header(0, 0, "", "file is truncated or damaged (no PNG header)")
+    width, height = int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    place = head.find(b"eXIf")
+    exif = b"" if place < 4 else head[place + 4 : place + 4 + int.from_bytes(head[place - 4 : place], "big")]
+    fault = "" if b"IEND\xaeB`\x82" in tail else "file is truncated (no PNG end marker)"
+    return Header(width, height, _exif_time(io.BytesIO(exif)), fault)
+
+
+def _tiff(file: BinaryIO) -> Header:
+    size = file.seek(0, io.SEEK_END)
+    try:
+        fields, _ = first_directory(file)
+    except ValueError:
+        return Header(0, 0, "", "file is truncated or damaged (no TIFF directory)")
+    width, height = _numbers(fields, _TIFF_WIDTH), _numbers(fields, _TIFF_HEIGHT)
+    if not width or not height:
+        return Header(0, 0, "", "file is truncated or damaged (no TIFF image size)")
+    ends = [
+        offset + length
+        for offsets, lengths in _TIFF_STRIPS
+        for offset, length in zip(_numbers(fields, offsets), _numbers(fields, lengths), strict=False)
+    ]
+    fault = "file is truncated (pixels beyond its end)" if max(ends, default=0) > size else ""
+    return Header(width[0], height[0], _exif_time(file), fault)
+
+
+def _numbers(fields: Directory, tag: int) -> tuple[int, ...]:
+    value = fields.get(tag, ())
+    return value if isinstance(value, tuple) else ()
+
+
+def _exif_time(block: BinaryIO) -> str:
+    """ISO 8601 time of a TIFF file or an EXIF block; empty if it has none."""
+    fields = exif_fields(block)
+    texts = [str(fields.get(tag, "")).strip() for tag in (_TIME, _SUBSECONDS, _OFFSET)]
+    date, _, time = texts[0].partition(" ")
+    if not time:
+        return ""
+    return f"{date.replace(':', '-')}T{time}{'.' + texts[1] if texts[1].isdigit() else ''}{texts[2] or 'Z'}"

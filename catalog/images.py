@@ -1,0 +1,89 @@
+"""Decoded images."""
+
+import io
+from typing import NamedTuple, cast
+
+import cv2
+import numpy as np
+from fsspec.core import url_to_fs
+from numpy.typing import NDArray
+
+from ..schemas.calibration import Camera
+from .digests import sha256
+from .image_headers import HEADER_BYTES, TAIL_BYTES, read_header
+
+
+class UnreadableImage(Exception):
+    """An image that cannot be used; carries why, as it is recorded in a frame's status.
+
+    Attributes
+    ----------
+    reason : "file is truncated (no JPEG end marker)" and the like.
+    """
+
+    def __init__(self, reason: str):
+        super().__init__(reason)
+        self.reason = reason
+
+
+class DecodedImage(NamedTuple):
+    """An image and the digest of the file it came from.
+
+    Attributes
+    ----------
+    bgr : (rows, cols, 3) uint8, blue green red; a greyscale image has three equal channels.
+    sha256 : of the file's bytes, hexadecimal.
+    """
+
+    bgr: NDArray[np.uint8]
+    sha256: str
+
+
+def read_image(mission: str, image: str, camera: Camera) -> DecodedImage:
+    """Read and decode one image of a mission.
+
+    Parameters
+    ----------
+    mission : folder or URL.
+    image : path in it.
+    camera : whose size the image must have.
+
+    Raises
+    ------
+    UnreadableImage
+        If the file is missing, truncated, damaged or of another size.
+    """
+    fs, root = url_to_fs(mission)
+    try:
+        content = cast(bytes, fs.cat_file(f"{root.rstrip('/')}/{image}"))
+    except OSError as error:
+        raise UnreadableImage(f"file cannot be read ({error.strerror or error})") from None
+    return DecodedImage(decode(content, camera), sha256(content))
+
+
+def decode(content: bytes, camera: Camera) -> NDArray[np.uint8]:
+    """Decode the bytes of a JPEG, PNG or TIFF file into BGR, uint8 (rows, cols, 3).
+
+    16 bits a channel become 8. The EXIF rotation is not applied: calibrations are of the sensor. What OpenCV
+    would fill with grey (a truncated JPEG) is refused. Raises UnreadableImage.
+    """
+    fault = read_header(content[:HEADER_BYTES], content[-TAIL_BYTES:], io.BytesIO(content)).fault
+    if fault:
+        raise UnreadableImage(fault)
+    try:
+        bgr = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        bgr = None
+    if bgr is None:
+        raise UnreadableImage("file is damaged (it cannot be decoded)")
+    fault = size_fault(bgr.shape[1], bgr.shape[0], camera)
+    if fault:
+        raise UnreadableImage(fault)
+    return np.asarray(bgr, np.uint8)
+
+
+def size_fault(width: int, height: int, camera: Camera) -> str:
+    """Why an image of this size cannot be this camera's; empty if it can."""
+    if (width, height) == (camera.width, camera.height):
+        return ""
+    return f"size {width}x{height}, calibration says {camera.width}x{camera.height}"

@@ -1,0 +1,122 @@
+"""Navigation at the times of the images."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.mission import NavigationSigma
+from ..schemas.navigation import Navigation, Tide
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+# A gap is longer than ten usual intervals, and than this: slow navigation has long intervals, not gaps.
+GAP_S = 10.0
+_GAP_INTERVALS = 10
+
+_PERIODIC = {"longitude", "roll", "heading"}
+SIGMAS = ("horizontal", "depth", "roll", "pitch", "heading")
+
+
+class Poses(NamedTuple):
+    """Navigation of (N,) images; NaN outside the navigation.
+
+    Attributes
+    ----------
+    values : longitude, latitude, elevation, altitude, roll, pitch, heading (degrees, metres) and sigma_*, (N,).
+    span : first and last time (ns) with a full pose.
+    in_gap : (N,) the image was taken in a gap of the navigation.
+    """
+
+    values: dict[str, Array]
+    span: tuple[int, int]
+    in_gap: NDArray[np.bool_]
+
+
+def at_times(navigation: Navigation, ns: Times, offset_s: float, sigma: NavigationSigma, tide: Tide | None) -> Poses:
+    """Interpolate navigation linearly; angles along the shorter way round.
+
+    Parameters
+    ----------
+    navigation : samples; each column is interpolated over the samples that have a value in it.
+    ns : (N,) int64 times of the images, nanoseconds since 1970 UTC.
+    offset_s : seconds added to navigation times (not to the tide's).
+    sigma : 1-sigma where navigation has no column for it.
+    tide : height of the sea surface to add to -depth, or None.
+
+    Returns
+    -------
+    Poses; altitude is NaN also where the altimeter had no return for longer than a gap, as an altitude
+    interpolated over that would be invented.
+    """
+    times = navigation.ns + round(offset_s * 1e9)
+    first, last = span(navigation, offset_s)
+    inside = (ns >= first) & (ns <= last)
+    named = {name: getattr(navigation, name) for name in ("longitude", "latitude", "roll", "pitch", "heading")}
+    values = {name: _interpolate(times, column, ns, name in _PERIODIC) for name, column in named.items()}
+    values["heading"] %= 360
+    values["elevation"] = -_interpolate(times, navigation.depth, ns, False)
+    if tide is not None:
+        values["elevation"] += _interpolate(tide.ns, tide.height, ns, False)
+    values["altitude"] = _altitude(times, navigation.altitude, ns)
+    for name in SIGMAS:
+        column = navigation.sigma.get(name, np.full(len(times), np.nan))
+        known = np.isfinite(column).any()
+        values[f"sigma_{name}"] = (
+            _interpolate(times, column, ns, False) if known else np.full(len(ns), getattr(sigma, name))
+        )
+    values = {name: np.where(inside, column, np.nan) for name, column in values.items()}
+    return Poses(values, (first, last), inside & _in_gap(times[_complete(navigation)], ns))
+
+
+def _complete(navigation: Navigation) -> NDArray[np.bool_]:
+    columns = [navigation.latitude, navigation.longitude, navigation.depth]
+    columns += [navigation.roll, navigation.pitch, navigation.heading]
+    return np.logical_and.reduce(np.isfinite(columns))
+
+
+def span(navigation: Navigation, offset_s: float) -> tuple[int, int]:
+    """First and last time (ns, offset applied) between which every part of a pose has samples on both sides."""
+    first, last = -(2**62), 2**62
+    for name in ("latitude", "longitude", "depth", "roll", "pitch", "heading"):
+        valid = navigation.ns[np.isfinite(getattr(navigation, name))]
+        if not len(valid):
+            return 0, -1
+        first, last = max(first, int(valid[0])), min(last, int(valid[-1]))
+    shift = round(offset_s * 1e9)
+    return first + shift, last + shift
+
+
+def _seconds(times: Times, origin: int) -> Array:
+    """Float seconds from an origin near by: nanoseconds since 1970 have too many digits for a float."""
+    return np.asarray((times - origin) * 1e-9, np.float64)
+
+
+def _interpolate(times: Times, values: Array, at: Times, periodic: bool) -> Array:
+    """Linear over the valid samples, held constant beyond them; angles of a period of 360 degrees unwrapped."""
+    valid = np.isfinite(values)
+    if not valid.any():
+        return np.full(len(at), np.nan)
+    known = np.unwrap(values[valid], period=360) if periodic else values[valid]
+    found = np.interp(_seconds(at, times[0]), _seconds(times[valid], times[0]), known)
+    return (found + 180) % 360 - 180 if periodic else found
+
+
+def _altitude(times: Times, altitude: Array, at: Times) -> Array:
+    valid = np.isfinite(altitude)
+    found = _interpolate(times, altitude, at, False)
+    if valid.any():
+        beyond = (at < times[valid][0]) | (at > times[valid][-1])
+        found[beyond | _in_gap(times[valid], at)] = np.nan
+    return found
+
+
+def _in_gap(times: Times, at: Times) -> NDArray[np.bool_]:
+    """Which of the times `at` fall between two samples that are too far apart."""
+    if len(times) < 2:
+        return np.zeros(len(at), bool)
+    intervals = np.diff(times) * 1e-9
+    longest = max(GAP_S, _GAP_INTERVALS * float(np.median(intervals)))
+    before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(intervals) - 1)
+    return (intervals[before] > longest) & (at > times[before]) & (at < times[before + 1])

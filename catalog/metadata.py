@@ -1,0 +1,184 @@
+"""quality.json and the metadata/ folder: provenance and a STAC item."""
+
+import hashlib
+import json
+import os
+import platform
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Final
+from uuid import uuid4
+
+import numpy as np
+import pyproj
+import rasterio
+from rasterio.coords import BoundingBox
+
+from ..schemas.base import Model
+from ..schemas.products import PRODUCTS, Product, Quality
+from ..schemas.provenance import Host, Provenance
+
+# Distributions whose version can change a result
+_SOFTWARE: Final = (
+    *("seamosaic", "numpy", "scipy", "opencv-python-headless", "gtsam", "rasterio", "pyproj", "dask", "xarray"),
+    *("laspy", "lazrs", "h5netcdf", "h5py", "pyogrio", "shapely", "pillow", "matplotlib"),
+)
+_OPEN3D: Final = ("open3d-cpu", "open3d")
+_PROJECTION: Final = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
+_FILE: Final = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
+_EDGE_STEPS: Final = 16
+_MULTIHASH_SHA256: Final = "1220"
+
+
+def sha256_of(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def output_digests(folder: str | os.PathLike[str]) -> dict[str, str]:
+    """SHA-256 of every file in a version's folder but those of metadata/, which tell of the others."""
+    root = Path(folder)
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    names = [(path.relative_to(root).as_posix(), path) for path in files]
+    return {name: sha256_of(path) for name, path in names if not name.startswith("metadata/")}
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of everything that can change a result."""
+    found = {"python": platform.python_version(), "gdal": rasterio.__gdal_version__, "proj": pyproj.proj_version_str}
+    for name in (*_SOFTWARE, *_OPEN3D):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # an optional one, or open3d's other build
+            continue
+    return found
+
+
+def host() -> Host:
+    """The kind of this machine."""
+    return Host(platform=f"{platform.system()} {platform.machine()}", cpu_count=os.cpu_count() or 1)
+
+
+def write_provenance(path: str | os.PathLike[str], provenance: Provenance) -> None:
+    """Write metadata/provenance.json."""
+    _write_model(path, provenance)
+
+
+def write_quality(path: str | os.PathLike[str], quality: Quality) -> None:
+    """Write quality.json."""
+    _write_model(path, quality)
+
+
+def _write_model(path: str | os.PathLike[str], model: Model) -> None:
+    _write_json(path, model.model_dump(mode="json"))
+
+
+def _write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{uuid4().hex[:8]}")
+    try:
+        temporary.write_text(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_stac_item(
+    folder: str | os.PathLike[str],
+    mission_id: str,
+    version_number: int,
+    title: str,
+    start: datetime,
+    end: datetime,
+    properties: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write metadata/stac-item.json (STAC 1.0) for a version whose map has geographic coordinates.
+
+    Geometry and projection are those of bathymetry.tif; every file of the product table that is in the folder
+    becomes an asset.
+
+    Parameters
+    ----------
+    start, end : first and last exposure, UTC.
+    properties : more properties of the item (license, platform, ...).
+    """
+    root = Path(folder)
+    with rasterio.open(root / "bathymetry.tif") as file:
+        crs, bounds = pyproj.CRS.from_wkt(file.crs.to_wkt()), file.bounds
+    ring = _geographic_outline(crs, bounds)
+    longitudes, latitudes = zip(*ring, strict=True)
+    code = _authority_code(crs)
+    item = {
+        "type": "Feature",
+        "stac_version": "1.0.0",
+        "stac_extensions": [_PROJECTION, _FILE],
+        "id": f"{mission_id}-v{version_number}",
+        "bbox": [min(longitudes), min(latitudes), max(longitudes), max(latitudes)],
+        "geometry": {"type": "Polygon", "coordinates": [[list(point) for point in ring]]},
+        "properties": {
+            "title": title or mission_id,
+            "datetime": None,
+            "start_datetime": _rfc3339(start),
+            "end_datetime": _rfc3339(end),
+            "created": _rfc3339(datetime.now(UTC)),
+            "proj:code": code,
+            **({} if code else {"proj:wkt2": crs.to_wkt("WKT2_2019")}),
+            "proj:bbox": list(bounds),
+            **(properties or {}),
+        },
+        "links": [],
+        "assets": {product.name: _asset(root, product) for product in _present(root)},
+    }
+    path = root / "metadata" / "stac-item.json"
+    _write_json(path, item)
+    return path
+
+
+def _authority_code(crs: pyproj.CRS) -> str | None:
+    """EPSG:code, or EPSG:horizontal+vertical for a compound CRS; None where a part has no code."""
+    codes = [part.to_authority() for part in (crs.sub_crs_list if crs.is_compound else [crs])]
+    if any(code is None for code in codes):
+        return None
+    return f"{codes[0][0]}:{'+'.join(code[1] for code in codes)}"
+
+
+def _present(root: Path) -> Iterable[Product]:
+    return (product for product in PRODUCTS if (root / product.name).is_file())
+
+
+def _asset(root: Path, product: Product) -> dict[str, Any]:
+    path = root / product.name
+    asset: dict[str, Any] = {
+        "href": f"../{product.name}",
+        "title": product.name,
+        "description": product.description,
+        "type": product.media_type,
+        "roles": [product.role],
+        "file:size": path.stat().st_size,
+        "file:checksum": _MULTIHASH_SHA256 + sha256_of(path),
+    }
+    if path.suffix == ".tif":
+        with rasterio.open(path) as file:
+            asset["proj:shape"] = [file.height, file.width]
+            asset["proj:transform"] = list(file.transform)[:6]
+    return asset
+
+
+def _geographic_outline(crs: pyproj.CRS, bounds: BoundingBox) -> list[tuple[float, float]]:
+    """WGS 84 longitude and latitude along the edge of the map, counter-clockwise and closed (RFC 7946)."""
+    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+    to_geographic = pyproj.Transformer.from_crs(horizontal, "EPSG:4326", always_xy=True)
+    left, bottom, right, top = bounds
+    corners = [(left, bottom), (right, bottom), (right, top), (left, top), (left, bottom)]
+    steps = np.arange(0, len(corners) - 1, 1 / _EDGE_STEPS)
+    xs, ys = (np.interp(steps, range(len(corners)), values) for values in zip(*corners, strict=True))
+    longitudes, latitudes = to_geographic.transform(xs, ys)
+    points = [(round(float(x), 9), round(float(y), 9)) for x, y in zip(longitudes, latitudes, strict=True)]
+    return [*points, points[0]]
+
+
+def _rfc3339(time: datetime) -> str:
+    return time.astimezone(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")

@@ -1,0 +1,157 @@
+"""The folder of a mission, local or in an object store: its files by relative path, and its images by pattern."""
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple, cast
+
+from fsspec import AbstractFileSystem
+from fsspec.core import url_to_fs
+
+from ..schemas.mission import Mission
+from ..schemas.problems import InvalidInput, Problem
+from ..schemas.yaml_document import Document
+from .digests import sha256
+
+_MAGIC = "*?["
+
+
+class ImageFile(NamedTuple):
+    """An image of the mission.
+
+    Attributes
+    ----------
+    image : path relative to the mission folder.
+    role : combined, texture or laser.
+    path : path in the file system.
+    info : its entry there.
+    """
+
+    image: str
+    role: str
+    path: str
+    info: dict[str, Any]
+
+
+class MissionFiles:
+    """Reads the files of a mission; remembers the digest of each text file read.
+
+    Attributes
+    ----------
+    url : as the user gave it.
+    fs, root : the file system and the folder in it.
+    digests : SHA-256 of the text files read, by relative path.
+    """
+
+    def __init__(self, url: str):
+        self.url = url
+        self.fs, root = _connect(url)
+        self.root = root.rstrip("/")
+        self.digests: dict[str, str] = {}
+
+    def read(self, name: str, asked: Problem | None, problems: list[Problem]) -> bytes | None:
+        """The bytes of a text file, or None and a problem.
+
+        Parameters
+        ----------
+        asked : a problem whose file, line and key say who asks for the file; its remedy is added.
+        """
+        try:
+            content = cast(bytes, self.fs.cat_file(f"{self.root}/{name}"))
+        except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+            problem = asked or Problem(name, None, "", "", "", "Give the folder that holds it.")
+            problems.append(problem._replace(found=f"no file {name} in {self.url}", expected="the file"))
+            return None
+        except OSError as error:
+            remedy = "Check its permissions and the connection."
+            problems.append(Problem(name, None, "", f"an unreadable file ({error})", "the file", remedy))
+            return None
+        self.digests[name] = sha256(content)
+        return content
+
+    def has(self, name: str) -> bool:
+        return self.fs.isfile(f"{self.root}/{name}")
+
+    def matching(self, pattern: str) -> dict[str, tuple[str, dict[str, Any]]]:
+        """Files that match a glob (`*`, `?`, `[…]`, `**` for folders): relative path to path and entry, sorted.
+
+        The folder's own name may hold such characters, which fsspec's glob would expand; so we match ourselves.
+        """
+        parts = pattern.split("/")
+        fixed = next((i for i, part in enumerate(parts) if any(sign in part for sign in _MAGIC)), len(parts) - 1)
+        found = self._files("/".join(parts[:fixed]), None if "**" in parts else len(parts) - fixed)
+        return {name: entry for name, entry in sorted(found.items()) if _matches(name.split("/"), parts)}
+
+    def folder_of(self, pattern: str) -> list[str]:
+        """Names of the files in the folder in which a pattern looks, for a message."""
+        folder = pattern.rpartition("/")[0]
+        if any(sign in folder for sign in _MAGIC):
+            folder = ""
+        return sorted(self._files(folder, 1))
+
+    def _files(self, folder: str, depth: int | None) -> dict[str, tuple[str, dict[str, Any]]]:
+        base = f"{self.root}/{folder}".rstrip("/")
+        found: dict[str, dict[str, Any]] = self.fs.find(base, maxdepth=depth, detail=True)  # type: ignore[assignment]
+        start = len(self.root) + 1
+        return {path[start:]: (path, info) for path, info in found.items()}
+
+
+def _connect(url: str) -> tuple[AbstractFileSystem, str]:
+    try:
+        fs, root = url_to_fs(url)
+        exists = fs.isdir(root)
+    except (ImportError, ValueError) as error:
+        remedy = "Give a folder, or a URL that fsspec reads; its driver (such as s3fs) has to be installed."
+        raise InvalidInput([Problem(url, None, "", f"no access ({error})", "a mission folder", remedy)]) from None
+    except OSError as error:
+        remedy = "Check the connection and the credentials."
+        raise InvalidInput([Problem(url, None, "", f"no access ({error})", "a mission folder", remedy)]) from None
+    if not exists:
+        found = "a file" if fs.exists(root) else "nothing"
+        remedy = "Give the folder that holds mission.yaml."
+        raise InvalidInput([Problem(url, None, "", found, "a mission folder", remedy)])
+    return fs, root
+
+
+def _matches(parts: Sequence[str], patterns: Sequence[str]) -> bool:
+    """Whether the parts of a path match those of a glob; as in a shell, hidden files only if asked for."""
+    if not patterns:
+        return not parts
+    if patterns[0] == "**":
+        return any(_matches(parts[i:], patterns[1:]) for i in range(len(parts) + 1))
+    if not parts or (parts[0].startswith(".") and not patterns[0].startswith(".")):
+        return False
+    return fnmatchcase(parts[0], patterns[0]) and _matches(parts[1:], patterns[1:])
+
+
+def find_images(files: MissionFiles, mission: Mission, document: Document) -> tuple[list[ImageFile], list[Problem]]:
+    """The images of all sets, sorted by path; a set without images and an image in two sets are problems."""
+    problems: list[Problem] = []
+    images: dict[str, ImageFile] = {}
+    owner: dict[str, str] = {}
+    for i, image_set in enumerate(mission.images):
+        line = document.line(("images", i, "path"))
+        matching = files.matching(image_set.path)
+        if not matching:
+            remedy = _no_match_remedy(files, image_set.path)
+            expected = f"images that match {image_set.path!r}"
+            problems.append(Problem(document.file, line, f"images.{i}.path", "no such file", expected, remedy))
+        twice = sorted(images.keys() & matching.keys())
+        if twice:
+            found = f"{len(twice)} images that {owner[twice[0]]!r} matches too, such as {twice[0]}"
+            remedy = "Make the patterns exclude each other."
+            expected = "each image in one set"
+            problems.append(Problem(document.file, line, f"images.{i}.path", found, expected, remedy))
+        for name, (path, info) in matching.items():
+            images.setdefault(name, ImageFile(name, image_set.role, path, info))
+            owner.setdefault(name, image_set.path)
+    return [images[name] for name in sorted(images)], problems
+
+
+def _no_match_remedy(files: MissionFiles, pattern: str) -> str:
+    names = files.folder_of(pattern)
+    if not names:
+        return "There is no file in that folder: check its name and that the images were copied."
+    alike = [name for name in names if _matches(name.lower().split("/"), pattern.lower().split("/"))]
+    if alike:
+        return f"Names are case-sensitive: there is {alike[0]}."
+    return f"Correct the pattern; in that folder there is {', '.join(names[:3])}{', …' if len(names) > 3 else ''}."

@@ -1,0 +1,179 @@
+"""What comes out: the product table (FORMATS, "Products") and the figures of quality.json and report.html."""
+
+from datetime import datetime
+from typing import Annotated, Final, NamedTuple
+
+from pydantic import Field
+
+from .base import Model
+
+Count = Annotated[int, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Metres = Annotated[float, Field(ge=0, description="metres")]
+Vector = tuple[float, float, float]
+
+_COG: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
+
+
+class Product(NamedTuple):
+    """One file of a version.
+
+    Attributes
+    ----------
+    name : path inside the version's folder, forward slashes.
+    description : for a person, one line.
+    media_type : as in a STAC asset.
+    role : STAC asset role: data, visual, overview or metadata.
+    """
+
+    name: str
+    description: str
+    media_type: str
+    role: str
+
+
+PRODUCTS: Final[tuple[Product, ...]] = (
+    Product("bathymetry.tif", "Elevation of the seabed, metres, positive up", _COG, "data"),
+    Product("uncertainty.tif", "1-sigma of the elevation of each cell, metres", _COG, "data"),
+    Product("density.tif", "Number of soundings in each cell", _COG, "data"),
+    Product("source.tif", "Where each cell comes from: 1 laser, 2 image matching, 3 interpolated", _COG, "data"),
+    Product("bathymetry.nc", "The four layers above in one CF-NetCDF file", "application/x-netcdf", "data"),
+    Product("mosaic.tif", "Orthomosaic over the 3D model, laser removed", _COG, "visual"),
+    Product(
+        "mosaic-source.tif", "Which image is behind each mosaic pixel: row of trajectory.csv, from 0", _COG, "data"
+    ),
+    Product("mosaic-planar.tif", "Conventional 2D mosaic that takes the seabed as a plane, to compare", _COG, "visual"),
+    Product("mesh.ply", "Coloured surface about a local origin", "application/ply", "data"),
+    Product("mesh.glb", "Textured surface about a local origin, for viewers", "model/gltf-binary", "visual"),
+    Product(
+        "soundings.laz", "Every accepted laser point with image number, arm and sigma", "application/vnd.laszip", "data"
+    ),
+    Product("trajectory.csv", "Position, attitude, sigma and status of every image", "text/csv", "data"),
+    Product(
+        "survey.gpkg", "Footprints, track, contours and coverage, for a GIS", "application/geopackage+sqlite3", "data"
+    ),
+    Product("quality.json", "Every figure of the report, for programs", "application/json", "metadata"),
+    Product("report.html", "This report", "text/html", "overview"),
+    Product(
+        "metadata/provenance.json",
+        "Every input, parameter and step behind this version",
+        "application/json",
+        "metadata",
+    ),
+)
+
+
+class ImageCounts(Model):
+    """How many images of what kind, and what became of them."""
+
+    total: Count
+    by_role: dict[str, Count] = Field(default_factory=dict)
+    by_status: dict[str, Count] = Field(default_factory=dict, description="adjusted, navigation, rejected")
+
+
+class MissionSummary(Model):
+    """The title block."""
+
+    id: str
+    title: str = ""
+    platform: str = ""
+    start: Annotated[datetime | None, Field(description="first exposure, UTC")] = None
+    end: Annotated[datetime | None, Field(description="last exposure, UTC")] = None
+    crs: Annotated[str | None, Field(description="name of the map's CRS; absent for a local frame")] = None
+    vertical_reference: Annotated[str, Field(description="what elevations are measured from")] = ""
+    images: ImageCounts
+
+
+class SoundingQuality(Model):
+    """Laser points."""
+
+    count: Count
+    per_image_median: Annotated[float | None, Field(ge=0)] = None
+    sigma_median_m: Metres | None = None
+    reasons: dict[str, Count] = Field(
+        default_factory=dict, description="why images gave no soundings: reason to images"
+    )
+
+
+class PairQuality(Model):
+    """Relative motions between overlapping images."""
+
+    tried: Count
+    linked: Count
+    homography: Count = 0
+    essential: Count = 0
+    median_inliers: Annotated[float | None, Field(ge=0)] = None
+
+
+class AxisDifference(Model):
+    """One axis of navigation minus adjusted position, metres."""
+
+    rms_m: Metres
+    max_m: Annotated[float, Field(ge=0, description="largest absolute difference, metres")]
+
+
+class NavigationDifference(Model):
+    """Navigation minus adjusted position along the map's axes."""
+
+    x: AxisDifference
+    y: AxisDifference
+    z: AxisDifference
+
+
+class TrajectoryQuality(Model):
+    """Poses."""
+
+    adjusted: Count
+    navigation_only: Count
+    rejected: Count
+    navigation_minus_adjusted: NavigationDifference | None = None
+    sigma_median_m: Annotated[Vector | None, Field(description="1-sigma along x, y, z, metres")] = None
+
+
+class SourceShares(Model):
+    """Shares of the cells with an elevation."""
+
+    laser: Share = 0.0
+    image_matching: Share = 0.0
+    interpolated: Share = 0.0
+
+
+class BathymetryQuality(Model):
+    """The elevation grid."""
+
+    cell_m: Annotated[float, Field(gt=0)]
+    cells: Annotated[int, Field(ge=0, description="cells with an elevation")]
+    area_m2: Annotated[float, Field(ge=0)]
+    by_source: SourceShares | None = None
+    elevation_min_m: float | None = None
+    elevation_median_m: float | None = None
+    elevation_max_m: float | None = None
+    sigma_median_m: Metres | None = None
+
+
+class MosaicQuality(Model):
+    """The orthomosaic."""
+
+    cell_m: Annotated[float, Field(gt=0)]
+    area_m2: Annotated[float, Field(ge=0)]
+    coverage_share: Annotated[Share | None, Field(description="of the area with an elevation")] = None
+
+
+class MeshQuality(Model):
+    """The surface."""
+
+    vertices: Count
+    triangles: Count
+
+
+class Quality(Model):
+    """A quality.json. A part that a mission has no data for is absent (null), never zero."""
+
+    mission: MissionSummary
+    soundings: SoundingQuality | None = None
+    pairs: PairQuality | None = None
+    trajectory: TrajectoryQuality | None = None
+    bathymetry: BathymetryQuality | None = None
+    mosaic: MosaicQuality | None = None
+    mesh: MeshQuality | None = None
+    warnings: tuple[str, ...] = ()

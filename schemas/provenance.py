@@ -1,0 +1,56 @@
+"""metadata/provenance.json: what a version was made from, by what, and how."""
+
+from datetime import datetime
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from .base import Model
+
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class InputFile(Model):
+    """A file of the mission, as it was read."""
+
+    sha256: Sha256
+    size: Annotated[int, Field(ge=0, description="bytes")]
+
+
+class Step(Model):
+    """One stage of the workflow: what was computed now and what was taken from an earlier run."""
+
+    name: str
+    code_version: str
+    count_total: Annotated[int, Field(ge=0)]
+    count_computed: Annotated[int, Field(ge=0)]
+    count_reused: Annotated[int, Field(ge=0)]
+    core_seconds: Annotated[float, Field(ge=0)]
+    started: datetime | None = None
+    ended: datetime | None = None
+
+
+class Host(Model):
+    """The kind of machine; nothing that tells which one."""
+
+    platform: str
+    cpu_count: Annotated[int, Field(ge=1)]
+
+
+class Provenance(Model):
+    """A provenance.json.
+
+    `digest` stands for everything that determines the products (inputs, parameters, code versions): a run
+    that comes to the same digest as the newest version makes no new one.
+    """
+
+    format: int = 1
+    digest: Annotated[str, Field(min_length=1)]
+    mission_id: str
+    created: datetime
+    software: Annotated[dict[str, str], Field(description="name to version")]
+    host: Host
+    inputs: Annotated[dict[str, InputFile], Field(description="path relative to the mission folder")]
+    parameters: Annotated[dict[str, Any], Field(description="every parameter, defaults and automatic values resolved")]
+    steps: tuple[Step, ...] = ()
+    outputs: dict[str, Sha256] = Field(default_factory=dict, description="path in the version's folder to SHA-256")

@@ -1,0 +1,245 @@
+"""All poses from pair motions and navigation in one estimate (paper IV and its outlook), solved by GTSAM.
+
+Navigation's errors are modelled as they are: attitude and depth as independent noise, horizontal position as one
+offset of the whole track (sigma_horizontal) plus a random walk from image to image. Pair motions enter as relative
+poses with their covariance under a robust kernel. Without navigation the first image is the datum and the motions
+are chained from it (paper IV).
+"""
+
+import itertools
+from typing import Any, Literal, NamedTuple
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from ..schemas.parameters import AdjustParameters
+from .motion import Motion
+from .navigation import NavigationPrior, Poses, relative
+
+Array = NDArray[Any]
+Status = Literal["adjusted", "navigation", "rejected: no link to the first image"]
+
+_DATUM_SIGMA = 1e-5
+# what calibration and the pinhole leave in a pair motion, whatever its matches say: 0.01 degree and 1 mm
+_LINK_FLOOR = np.diag([np.radians(0.01)] * 3 + [1e-3] * 3) ** 2
+
+
+class Link(NamedTuple):
+    """The motion between images i < j."""
+
+    i: int
+    j: int
+    motion: Motion
+
+
+class Adjusted(NamedTuple):
+    """Poses of all images.
+
+    Attributes
+    ----------
+    poses : cameras in the local frame, NaN where `status` is rejected.
+    sigma_m : (n, 3) 1-sigma of the camera centres along the local axes.
+    sigma_tilt_rad : (n,) 1-sigma of the angle by which the optical axis may lean, about either image axis.
+    status : per image.
+    used : (links,) bool, False for links that contradict navigation or each other.
+    """
+
+    poses: Poses
+    sigma_m: Array
+    sigma_tilt_rad: Array
+    status: list[Status]
+    used: NDArray[np.bool_]
+
+
+def adjust(
+    count: int, links: list[Link], navigation: NavigationPrior | None, R_first: Array, p: AdjustParameters
+) -> Adjusted:
+    """Estimate the poses of `count` images in order of time.
+
+    links must be metric where there is no navigation; with navigation those that are not are scaled by it.
+    R_first : R_local_camera (3, 3) of the first image, used without navigation only.
+    """
+    if navigation is not None:
+        links = [_scaled_by_navigation(link, navigation) for link in links]
+    plausible = np.array([_plausible(link, navigation) for link in links], bool)
+    usable = [link for link, ok in zip(links, plausible, strict=True) if ok]
+    # once with all, then without the links that contradict the rest
+    start, graph = _start(count, usable, navigation, R_first)
+    kernel = gtsam.noiseModel.mEstimator.Huber.Create(p.robust_threshold)
+    values = _solve(graph, _within(usable, start), start, kernel)
+    usable = [link for link in _within(usable, start) if _agrees(link, values)]
+    start, graph = _start(count, usable, navigation, R_first)
+    usable = _within(usable, start)
+    values = _solve(graph, usable, start, kernel)
+    kept = {(link.i, link.j) for link in usable}
+    poses = _poses(values, start)
+    sigma_m, sigma_tilt = _sigmas(_total(graph, usable, kernel), values, poses)
+    return Adjusted(
+        poses=poses,
+        sigma_m=sigma_m,
+        sigma_tilt_rad=sigma_tilt,
+        status=_status(usable, poses, navigation),
+        used=np.array([(link.i, link.j) in kept for link in links], bool),
+    )
+
+
+def _plausible(link: Link, navigation: NavigationPrior | None) -> bool:
+    return link.motion.metric if navigation is None else _agrees_with_navigation(link, navigation)
+
+
+def _start(count: int, links: list[Link], navigation: NavigationPrior | None, R_first: Array) -> tuple[Poses, Any]:
+    """First values of all poses that can have one, and the factors that tie them to the ground."""
+    if navigation is not None:
+        return navigation.poses, _navigation_factors(navigation)
+    start = _chain(count, links, R_first)
+    return start, _datum(start, int(np.flatnonzero(start.known)[0]))
+
+
+def _within(links: list[Link], start: Poses) -> list[Link]:
+    known = start.known
+    return [link for link in links if known[link.i] and known[link.j]]
+
+
+def _pose(R: Array, C: Array) -> Any:
+    return gtsam.Pose3(gtsam.Rot3(R), np.asarray(C, float))
+
+
+def _chain(count: int, links: list[Link], R_first: Array) -> Poses:
+    """Motions chained outwards from the first linked image along the links with most matches (paper IV)."""
+    R, C = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
+    if not links:
+        R[0], C[0] = R_first, 0.0
+        return Poses(R, C)
+    i, j = np.array([[link.i, link.j] for link in links]).T
+    weight = np.array([1.0 / len(link.motion.inliers) for link in links])
+    by_pair = {(link.i, link.j): link.motion for link in links}
+    graph = coo_array((weight, (i, j)), shape=(count, count)).tocsr()
+    _, label = connected_components(graph, directed=False)
+    root = int(np.flatnonzero(label == np.bincount(label).argmax())[0])
+    R[root], C[root] = R_first, 0.0
+    order, parent = breadth_first_order(graph, root, directed=False)
+    for node in order[1:]:
+        base = int(parent[node])
+        if base < node:
+            motion = by_pair[base, int(node)]
+            R[node], C[node] = R[base] @ motion.R_i_j, C[base] + R[base] @ motion.t_i_j
+        else:
+            motion = by_pair[int(node), base]
+            R[node] = R[base] @ motion.R_i_j.T
+            C[node] = C[base] - R[node] @ motion.t_i_j
+    return Poses(R, C)
+
+
+def _datum(start: Poses, first: int) -> Any:
+    graph = gtsam.NonlinearFactorGraph()
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, _DATUM_SIGMA)
+    graph.add(gtsam.PriorFactorPose3(first, _pose(start.R_local_camera[first], start.C_local[first]), noise))
+    return graph
+
+
+def _navigation_factors(navigation: NavigationPrior) -> Any:
+    graph = gtsam.NonlinearFactorGraph()
+    poses = navigation.poses
+    known = np.flatnonzero(poses.known)
+    # the whole track shares one offset: n priors together weigh as much as one position of sigma_horizontal
+    horizontal = navigation.sigma_horizontal * np.sqrt(len(known))
+    for k in known:
+        R = poses.R_local_camera[k]
+        position = R.T @ np.diag([horizontal[k], horizontal[k], navigation.sigma_depth[k]]) ** 2 @ R
+        attitude = np.diag(navigation.sigma_attitude[k] ** 2)
+        rotation = navigation.R_camera_vehicle @ attitude @ navigation.R_camera_vehicle.T
+        noise = _gaussian(np.asarray(block_diag(rotation, position)))
+        graph.add(gtsam.PriorFactorPose3(int(k), _pose(R, poses.C_local[k]), noise))
+    for a, b in itertools.pairwise(known.tolist()):
+        step = relative(navigation, a, b)
+        noise = _gaussian(step.covariance)
+        graph.add(gtsam.BetweenFactorPose3(a, b, _pose(step.R_i_j, step.t_i_j), noise))
+    return graph
+
+
+def _gaussian(covariance: Array) -> Any:
+    return gtsam.noiseModel.Gaussian.Covariance((covariance + covariance.T) / 2)
+
+
+def _scaled_by_navigation(link: Link, navigation: NavigationPrior) -> Link:
+    """A link without laser scale takes the length of navigation's step, and its uncertainty."""
+    motion = link.motion
+    if motion.metric:
+        return link
+    prior = relative(navigation, link.i, link.j)
+    length = float(np.linalg.norm(prior.t_i_j))
+    along = motion.R_i_j.T @ motion.t_i_j
+    sigma = float(np.sqrt(along @ prior.covariance[3:, 3:] @ along))
+    covariance = motion.covariance.copy()
+    covariance[3:] *= length
+    covariance[:, 3:] *= length
+    covariance[3:, 3:] += np.outer(along, along) * sigma**2
+    scaled = motion._replace(t_i_j=motion.t_i_j * length, covariance=covariance, scale_sigma=sigma / max(length, 1e-6))
+    return link._replace(motion=scaled)
+
+
+def _agrees_with_navigation(link: Link, navigation: NavigationPrior) -> bool:
+    """Within five sigma of navigation's own motion between the two images: repeated texture makes false links."""
+    prior = relative(navigation, link.i, link.j)
+    return _distance(link.motion, _pose(prior.R_i_j, prior.t_i_j), prior.covariance + link.motion.covariance) < 5
+
+
+def _distance(motion: Motion, other: Any, covariance: Array) -> float:
+    """Mahalanobis distance of a motion from another pose of j in i, divided by the root of the six dimensions."""
+    off = _pose(motion.R_i_j, motion.t_i_j).localCoordinates(other)
+    return float(np.sqrt(off @ np.linalg.solve(covariance, off) / 6))
+
+
+def _total(graph: Any, links: list[Link], kernel: Any) -> Any:
+    """The factors of graph and those of the links under a robust kernel."""
+    total = gtsam.NonlinearFactorGraph(graph)
+    for link in links:
+        noise = gtsam.noiseModel.Robust.Create(kernel, _gaussian(link.motion.covariance + _LINK_FLOOR))
+        total.add(gtsam.BetweenFactorPose3(link.i, link.j, _pose(link.motion.R_i_j, link.motion.t_i_j), noise))
+    return total
+
+
+def _solve(graph: Any, links: list[Link], start: Poses, kernel: Any) -> Any:
+    values = gtsam.Values()
+    for k in np.flatnonzero(start.known):
+        values.insert(int(k), _pose(start.R_local_camera[k], start.C_local[k]))
+    total = _total(graph, links, kernel)
+    return gtsam.LevenbergMarquardtOptimizer(total, values, gtsam.LevenbergMarquardtParams()).optimize()
+
+
+def _agrees(link: Link, values: Any) -> bool:
+    """Whether the solution is within six sigma of a link's motion."""
+    between = values.atPose3(link.i).between(values.atPose3(link.j))
+    return _distance(link.motion, between, link.motion.covariance + _LINK_FLOOR) < 6
+
+
+def _poses(values: Any, start: Poses) -> Poses:
+    R, C = np.full_like(start.R_local_camera, np.nan), np.full_like(start.C_local, np.nan)
+    for k in np.flatnonzero(start.known):
+        pose = values.atPose3(int(k))
+        R[k], C[k] = pose.rotation().matrix(), pose.translation()
+    return Poses(R, C)
+
+
+def _sigmas(total: Any, values: Any, poses: Poses) -> tuple[Array, Array]:
+    marginals = gtsam.Marginals(total, values)
+    count = len(poses.C_local)
+    position, tilt = np.full((count, 3), np.nan), np.full(count, np.nan)
+    for k in np.flatnonzero(poses.known):
+        R, covariance = poses.R_local_camera[k], marginals.marginalCovariance(int(k))
+        position[k] = np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T))
+        tilt[k] = np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)
+    return position, tilt
+
+
+def _status(links: list[Link], poses: Poses, navigation: NavigationPrior | None) -> list[Status]:
+    if navigation is None:
+        return ["adjusted" if ok else "rejected: no link to the first image" for ok in poses.known]
+    linked = np.zeros(len(poses.C_local), bool)
+    for link in links:
+        linked[[link.i, link.j]] = True
+    return ["adjusted" if ok else "navigation" for ok in linked]

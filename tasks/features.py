@@ -1,0 +1,85 @@
+"""SIFT features of an image and their matches between two images (paper III.E)."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.parameters import FeatureParameters
+
+_CELLS_PER_SIDE = 8
+
+
+class Features(NamedTuple):
+    """Interest points of one image.
+
+    Attributes
+    ----------
+    uv : (N, 2) float32 pixels at full resolution.
+    scale_px : (N,) float32 diameter of the neighbourhood, pixels at full resolution.
+    descriptors : (N, 128) uint8 SIFT.
+    """
+
+    uv: NDArray[np.float32]
+    scale_px: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+
+def detect(grey: NDArray[np.uint8], ignore: NDArray[np.bool_], parameters: FeatureParameters) -> Features:
+    """SIFT features of a grey image (H, W), none of them on pixels to ignore (H, W), such as the laser.
+
+    Images are halved until they have no more than `max_pixels`; the strongest features are kept evenly over the
+    image, so that a bright corner does not take them all.
+    """
+    halvings = 0
+    while grey.size > parameters.max_pixels:
+        grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+        halvings += 1
+    mask = cv2.resize((~ignore).astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    sift = cv2.SIFT_create(contrastThreshold=parameters.contrast_threshold)
+    keypoints, descriptors = sift.detectAndCompute(grey, mask)
+    if not keypoints:
+        return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 128), np.uint8))
+    uv = np.array([k.pt for k in keypoints], np.float32)
+    response = np.array([k.response for k in keypoints])
+    keep = _strongest_everywhere(uv, response, grey.shape, parameters.max_features)
+    # pixel centres at integers: the centre of a halved pixel lies between two full ones
+    full = (uv[keep] + 0.5) * 2**halvings - 0.5
+    scale = np.array([keypoints[k].size for k in keep], np.float32) * 2**halvings
+    return Features(full.astype(np.float32), scale, descriptors[keep].astype(np.uint8))
+
+
+def _strongest_everywhere(uv: NDArray, response: NDArray, shape: tuple[int, ...], count: int) -> NDArray[np.intp]:
+    """Indices of at most `count` features: by rank of their response within their cell of the image."""
+    if len(uv) <= count:
+        return np.arange(len(uv))
+    column = np.minimum(uv[:, 0] * _CELLS_PER_SIDE / shape[1], _CELLS_PER_SIDE - 1).astype(int)
+    row = np.minimum(uv[:, 1] * _CELLS_PER_SIDE / shape[0], _CELLS_PER_SIDE - 1).astype(int)
+    cell = row * _CELLS_PER_SIDE + column
+    order = np.lexsort((-response, cell))
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(cell[order])) + 1])
+    rank = np.arange(len(uv)) - np.repeat(starts, np.diff([*starts, len(uv)]))
+    return order[np.argsort(rank, kind="stable")[:count]]
+
+
+def match(descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8], ratio: float) -> NDArray[np.intp]:
+    """Mutual nearest neighbours (M, 2) that pass Lowe's ratio test, by the Hellinger distance (RootSIFT)."""
+    if len(descriptors_a) < 2 or len(descriptors_b) < 2:
+        return np.zeros((0, 2), np.intp)
+    similarity = _root(descriptors_a) @ _root(descriptors_b).T
+    best = similarity.argmax(1)
+    rows = np.arange(len(best))
+    first = similarity[rows, best]
+    mutual = similarity.argmax(0)[best] == rows
+    similarity[rows, best] = -1
+    second = similarity.max(1)
+    # |a - b|^2 = 2 - 2 a.b for unit vectors
+    distinct = (1 - first) < ratio**2 * (1 - second)
+    keep = np.flatnonzero(mutual & distinct)
+    return np.column_stack([keep, best[keep]])
+
+
+def _root(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    values = descriptors.astype(np.float32)
+    return np.sqrt(values / np.maximum(values.sum(1, keepdims=True), 1))

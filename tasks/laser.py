@@ -1,0 +1,287 @@
+"""Laser points in an image (paper III.B): where each row crosses a line of light, to a fraction of a pixel.
+
+The paper's structure is kept: green channel stretched to 0-255, second derivative along the rows by a kernel
+applied twice, one threshold on intensity and one on the derivative, the positive-negative-positive sequence, orphans
+rejected. Four things are added, because a strobe-lit bottom breaks global statistics:
+
+- the image is first reduced, by averaging, to the scale at which the kernel answers to the line that is there, so
+  that 3600 px and 1200 px wide images are treated alike and large ones cost little more than small ones;
+- intensity is measured above the local background (a median of the reduced image): the mean of the paper's
+  "mean + k sigma" is the mean of the place, and vignetting does not hide the line in dark corners;
+- sigma is robust (median absolute deviation), for the line itself would otherwise raise it;
+- orphans are judged by the chain of points from row to row that they belong to, and in colour images by its colour.
+"""
+
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.parameters import LaserParameters
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Indices = NDArray[np.intp]
+
+KERNEL: Final = np.array([-1, -1, -1, 0, 1, 1, 1], np.float32)
+_TWICE: Final = np.convolve(KERNEL, KERNEL).astype(np.float32)[None]
+_NOISE_GAIN: Final = float(np.sqrt((_TWICE**2).sum()))
+_REDUCTIONS: Final = (1, 2, 3, 4, 6, 8, 12, 16)
+_SMALLEST_PX: Final = 160
+# The positive peaks beside a line's negative one lie 3 to 9 px from it.
+_LOBE_OFFSET, _LOBE_HALFWIDTH = 6, 3
+_LOBE_SHARE: Final = 0.2
+_WINDOW_PX: Final = 12
+_SPECKLE_PX: Final = 0.25
+
+
+class LaserPoints(NamedTuple):
+    """Points of laser lines in one image, sorted by row.
+
+    Attributes
+    ----------
+    uv : (N, 2) pixels of the full image; v is the middle of the rows that were averaged.
+    prominence : (N,) height of the line above the background beside it, grey levels.
+    sigma_px : (N,) 1-sigma of u, pixels.
+    width_px : (N,) standard deviation of the line's profile along the row, pixels.
+    step_px : distance between rows, pixels: the reduction at which the line was found.
+    """
+
+    uv: Array
+    prominence: Array
+    sigma_px: Array
+    width_px: Array
+    step_px: int
+
+    def take(self, keep: NDArray) -> "LaserPoints":
+        """The points that a mask or an index array (N,) selects."""
+        uv, prominence, sigma_px, width_px = (field[keep] for field in self[:4])
+        return LaserPoints(uv, prominence, sigma_px, width_px, self.step_px)
+
+
+def no_points(step_px: int = 1) -> LaserPoints:
+    """Nothing found."""
+    none = np.zeros(0)
+    return LaserPoints(np.zeros((0, 2)), none, none, none, step_px)
+
+
+def detect(image_bgr: NDArray[np.uint8], parameters: LaserParameters) -> LaserPoints:
+    """Points where the rows of an image cross a laser line (paper III.B).
+
+    Rows are scanned, so a line has to run across them: give the transposed image for a line along the rows.
+
+    Parameters
+    ----------
+    image_bgr : (H, W, 3) colour or (H, W) grey, uint8
+    parameters : thresholds
+
+    Returns
+    -------
+    LaserPoints, without any point where an image has no line.
+    """
+    if min(image_bgr.shape[:2]) < _SMALLEST_PX:
+        return no_points()
+    step = reduction(_green(image_bgr))
+    height, width = (side // step for side in image_bgr.shape[:2])
+    size = (width, height)
+    whole = image_bgr[: height * step, : width * step]
+    small = np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8)
+    green = _green(small).astype(np.float32)
+    low, high = float(green.min()), float(green.max())
+    if high - low < 4:
+        return no_points(step)
+    stretch = 255 / (high - low)
+    stretched = (green - low) * stretch
+    second = np.asarray(cv2.filter2D(stretched, -1, _TWICE, borderType=cv2.BORDER_REPLICATE), np.float32)
+    noise = _noise(second, stretch)
+    rows, columns, strong = candidates(stretched, second, noise, parameters)
+    keep = strong if small.ndim == 2 else _green_light(small, rows, columns, parameters.colour_share)
+    rows, columns, strong = rows[keep], columns[keep], strong[keep]
+    chain = linked(rows, columns, (height, width))
+    keep = np.bincount(chain, strong)[chain] >= parameters.chain_min_points
+    rows, columns = rows[keep], columns[keep]
+    u, sigma, prominence = _peaks(stretched, rows, columns)
+    uncertainty = _uncertainty(u, rows, sigma, prominence * _NOISE_GAIN / noise)
+    middle = 0.5 * (step - 1)
+    uv = np.column_stack([u, rows]).astype(np.float64) * step + middle
+    return LaserPoints(uv, prominence / stretch, uncertainty * step, sigma * step, step)
+
+
+def _green(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return image if image.ndim == 2 else np.asarray(cv2.extractChannel(image, 1), np.uint8)
+
+
+def reduction(green: NDArray[np.uint8]) -> int:
+    """By how much to reduce an image (H, W) so that its line is as narrow as the kernel: a whole number.
+
+    The kernel applied twice answers best to a line of 1.5 px (1 sigma) and with 0.6 of that to one of 3.5 px. In
+    some rows, spread over the image, the strongest complete sequence (both positive peaks and the negative one
+    between them) is measured at each reduction; the finest that has 0.6 of the best is taken.
+    """
+    every = max(1, green.shape[0] // 96)
+    rows = green[every // 2 :: every]
+    strength = []
+    for factor in _REDUCTIONS:
+        width = green.shape[1] // factor
+        if min(width, green.shape[0] // factor) < _SMALLEST_PX:
+            break
+        reduced = cv2.resize(rows, (width, len(rows)), interpolation=cv2.INTER_AREA).astype(np.float32)
+        second = cv2.filter2D(reduced, -1, _TWICE, borderType=cv2.BORDER_REPLICATE)
+        lobes = cv2.dilate(second, np.ones((1, 2 * _LOBE_HALFWIDTH + 1), np.uint8))
+        middle = slice(_LOBE_OFFSET, width - _LOBE_OFFSET)
+        beside = np.minimum(lobes[:, : -2 * _LOBE_OFFSET], lobes[:, 2 * _LOBE_OFFSET :])
+        strength.append(float(np.median(np.minimum(-second[:, middle], 2 * beside).max(axis=1))))
+    enough = [factor for factor, s in zip(_REDUCTIONS, strength, strict=False) if s >= 0.6 * max(strength)]
+    return enough[0]
+
+
+def _noise(second: Floats, stretch: float) -> float:
+    """Robust sigma of the second derivative, not below that of rounding to whole grey levels."""
+    return max(1.4826 * float(np.median(np.abs(second[::3, ::5]))), _NOISE_GAIN * stretch / np.sqrt(12))
+
+
+def candidates(
+    green: Floats, second: Floats, noise: float, parameters: LaserParameters
+) -> tuple[Indices, Indices, NDArray[np.bool_]]:
+    """Rows and columns of the pixels that pass both thresholds and the sequence of peaks (paper III.B).
+
+    Also those that pass at half the thresholds; the third array says which are strong. A faint stretch (a face turned
+    away, a dark stone) is kept for the strong line that it continues.
+    """
+    contrast = green - _background(green)
+    floor = parameters.intensity_sigmas * 1.4826 * float(np.median(np.abs(contrast[::3, ::5])))
+    ceiling = -parameters.curvature_sigmas * noise
+    valley = cv2.erode(second, np.ones((1, 5), np.uint8))
+    mask = (second < 0.5 * ceiling) & (second <= valley) & (contrast > 0.5 * floor)
+    reach = _WINDOW_PX + 1
+    mask[:, :reach] = mask[:, -reach:] = False
+    rows, columns = np.nonzero(mask)
+    span = np.arange(-_LOBE_HALFWIDTH, _LOBE_HALFWIDTH + 1)
+    for side in (-_LOBE_OFFSET, _LOBE_OFFSET):
+        lobe = second[rows[:, None], columns[:, None] + side + span].max(axis=1)
+        keep = lobe > -_LOBE_SHARE * second[rows, columns]
+        rows, columns = rows[keep], columns[keep]
+    return rows, columns, (second[rows, columns] < ceiling) & (contrast[rows, columns] > floor)
+
+
+def _background(green: Floats) -> Floats:
+    """What a pixel would be without the line: the median over about 1/20 of the image around it."""
+    height, width = green.shape
+    small = cv2.resize(green, (max(width // 8, 16), max(height // 8, 16)), interpolation=cv2.INTER_AREA)
+    smooth = cv2.medianBlur(small.astype(np.uint8), 9)
+    return cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32)
+
+
+def _peaks(green: Floats, rows: Indices, columns: Indices) -> tuple[Array, Array, Array]:
+    """Sub-pixel column, width (1 sigma) and prominence of each line crossing.
+
+    The column is the fixed point of a centroid above the local background (a straight line between the two ends
+    of the window) under a Gaussian weight 1.5 times as wide as the line: the peak of a matched filter. It uses the
+    whole profile, so a saturated plateau or speckle on the crest does not draw it to one side.
+    """
+    offset = np.arange(-_WINDOW_PX, _WINDOW_PX + 1)
+    profile = green[rows[:, None], columns[:, None] + offset].astype(np.float64)
+    left, right = (np.median(profile[:, end], axis=1) for end in (slice(0, 4), slice(-4, None)))
+    share = (offset + _WINDOW_PX) / (2 * _WINDOW_PX)
+    profile = np.maximum(profile - left[:, None] - (right - left)[:, None] * share, 0)
+    centre, sigma = np.zeros(len(rows)), np.full(len(rows), 2.0)
+    for _ in range(8):
+        wide = 1.5 * sigma
+        weight = profile * np.exp(-0.5 * ((offset - centre[:, None]) / wide[:, None]) ** 2)
+        total = np.maximum(weight.sum(axis=1), 1e-9)
+        step = (weight * (offset - centre[:, None])).sum(axis=1) / total
+        spread = (weight * (offset - centre[:, None]) ** 2).sum(axis=1) / total
+        # the weight narrows a Gaussian profile: 1/spread = 1/sigma^2 + 1/wide^2
+        sigma = np.clip(np.sqrt(1 / np.maximum(1 / np.maximum(spread, 1e-3) - 1 / wide**2, 0.03)), 0.5, 4.0)
+        centre = np.clip(centre + 1.3 * step, -4, 4)
+    return columns + centre, sigma, profile[:, _WINDOW_PX - 1 : _WINDOW_PX + 2].mean(axis=1)
+
+
+def linked(rows: Indices, columns: Indices, shape: tuple[int, int]) -> NDArray[np.int32]:
+    """Number of the line (N,) that each pixel is on: neighbours within 3 rows and 7 columns hang together."""
+    mask = np.zeros(shape, np.uint8)
+    mask[rows, columns] = 1
+    grown = cv2.dilate(mask, np.ones((3, 7), np.uint8))
+    number = np.asarray(cv2.connectedComponents(grown, connectivity=8, ltype=cv2.CV_32S)[1], np.int32)
+    return number[rows, columns]
+
+
+def _green_light(small: NDArray[np.uint8], rows: Indices, columns: Indices, share: float) -> NDArray[np.bool_]:
+    """Which candidates have the laser's colour.
+
+    A pale stone adds to blue and red what it adds to green, in proportion to the light that falls on it; the laser
+    adds nearly nothing to them. Clipped pixels are left out. In grey images nothing can be told, and nor can it
+    where the line outshines the background: there is no texture there to take for a line.
+    """
+    offset = np.arange(-_WINDOW_PX, _WINDOW_PX + 1)
+    profile = small[rows[:, None], columns[:, None] + offset].astype(np.float32)
+    if not len(rows) or np.abs(profile - profile[..., 1:2]).mean() < 1:
+        return np.ones(len(rows), bool)
+    beside = 0.5 * (np.median(profile[:, :4], axis=1) + np.median(profile[:, -4:], axis=1))
+    crest = profile[:, np.abs(offset) <= 4]
+    weight = (crest[..., 1] < 250)[..., None].astype(np.float32)
+    added = (weight * (crest - beside[:, None])).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
+    other = (added[:, 0] + added[:, 2]) * beside[:, 1]
+    expected = (beside[:, 0] + beside[:, 2]) * added[:, 1]
+    return (other < share * expected) | (added[:, 1] > beside[:, 1])
+
+
+def _uncertainty(u: Array, rows: Indices, sigma: Array, signal_to_noise: Array) -> Array:
+    """1-sigma of each point's column: pixel noise by its Cramér-Rao bound, 1.06 sqrt(sigma)/SNR, and speckle.
+
+    Speckle is the same for all points of an image; it is what the scatter of the points about the straight line
+    between their neighbours four rows above and below has beyond the pixel noise.
+    """
+    bound = 1.06 * np.sqrt(sigma) / np.maximum(signal_to_noise, 1)
+    gap = 4
+    above, below = _nearest_in_row(u, rows, rows - gap), _nearest_in_row(u, rows, rows + gap)
+    paired = (rows[above] == rows - gap) & (rows[below] == rows + gap)
+    paired &= (np.abs(u[above] - u) < 3 * gap) & (np.abs(u[below] - u) < 3 * gap)
+    if paired.sum() < 20:
+        return np.hypot(bound, _SPECKLE_PX)
+    scatter = (u - 0.5 * (u[above] + u[below]))[paired]
+    # median of a squared normal variable: 0.4549 of its variance; the scatter has 1 + 2/4 of a point's variance
+    variance = np.median(scatter**2) / 0.4549 / 1.5 - np.median(bound[paired] ** 2)
+    return np.sqrt(bound**2 + max(variance, (0.1 * _SPECKLE_PX) ** 2))
+
+
+def _nearest_in_row(u: Array, rows: Indices, wanted: Indices) -> Indices:
+    """For each point, which point of the wanted row is nearest to its column (any point where that row has none)."""
+    if not len(u):
+        return np.zeros(0, np.intp)
+    scale = 4.0 * (u.max() + 1)
+    key = rows * scale + u
+    order = np.argsort(key, kind="stable")
+    place = np.searchsorted(key[order], wanted * scale + u)
+    right, left = (order[np.clip(place + shift, 0, len(u) - 1)] for shift in (0, -1))
+    distance_right, distance_left = (np.abs(key[n] - wanted * scale - u) for n in (right, left))
+    return np.where(distance_left < distance_right, left, right)
+
+
+def distance_in_row(points: LaserPoints) -> Array:
+    """Distance (N,) in pixels of each point from the nearest other one in its row; infinite where it is alone."""
+    uv = points.uv
+    order = np.lexsort((uv[:, 0], uv[:, 1]))
+    gap = np.where(np.diff(uv[order, 1]) == 0, np.diff(uv[order, 0]), np.inf)
+    distance = np.empty(len(uv))
+    distance[order] = np.minimum(np.append(gap, np.inf), np.insert(gap, 0, np.inf))
+    return distance
+
+
+def mask(shape: tuple[int, int], uv: Array, halfwidth_px: float) -> NDArray[np.bool_]:
+    """The pixels (H, W) to take from an image's texture because the laser is on them.
+
+    Parameters
+    ----------
+    shape : height and width of the image.
+    uv : (N, 2) pixels along the line of light, without gaps (triangulation.ImageSoundings.line_uv).
+    halfwidth_px : how far the light reaches to each side along a row.
+    """
+    drawn = np.zeros(shape, np.uint8)
+    radius = max(1, round(halfwidth_px))
+    fixed = np.round(np.asarray(uv).reshape(-1, 2)).astype(int)
+    inside = ((fixed >= -radius) & (fixed < np.array(shape[::-1]) + radius)).all(axis=1)
+    for u, v in fixed[inside].tolist():
+        cv2.circle(drawn, (u, v), radius, 1, cv2.FILLED)
+    return drawn.astype(bool)

@@ -1,0 +1,335 @@
+"""Metric motion of the camera between two overlapping images (paper III.E).
+
+The laser decides how: where the soundings of both images lie on a plane, the motion comes from the homography,
+which that plane makes metric; elsewhere from the essential matrix, made metric by the ratio of laser depths to
+triangulated depths over all features near soundings. Image points are slopes (x/z, y/z) in the camera frame.
+"""
+
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from ..schemas.parameters import MatchParameters
+from .navigation import RelativePrior
+
+Array = NDArray[Any]
+
+_PIXEL_SIGMA = 0.5  # of a SIFT match, pixels at full resolution
+_SCALE_RADIUS = 0.03  # slope within which a sounding tells a feature's depth: 9 cm at 3 m
+_MIN_SCALE_FEATURES = 5
+_UNIT_LENGTH_SIGMA = 1e-3
+_MAX_MATCHES = 1500
+
+
+class Plane(NamedTuple):
+    """normal . X = offset, with the share of points within tolerance and their rms distance, metres."""
+
+    normal: Array
+    offset: float
+    share: float
+    rms_m: float
+
+
+class Motion(NamedTuple):
+    """Pose of camera j in the frame of camera i.
+
+    Attributes
+    ----------
+    R_i_j : (3, 3). t_i_j : (3,) camera j's centre in camera i's frame, metres if `metric`, else of unit length.
+    covariance : (6, 6) of (rotation, translation), radians and metres, perturbing on the right: R exp(w), t + R v.
+    inliers : (M,) indices of the matches that agree.
+    model : homography or essential.
+    metric : whether the laser gave the scale.
+    scale_sigma : relative 1-sigma of the scale (nan when not metric).
+    """
+
+    R_i_j: Array
+    t_i_j: Array
+    covariance: Array
+    inliers: NDArray[np.intp]
+    model: Literal["homography", "essential"]
+    metric: bool
+    scale_sigma: float
+
+
+def fit_plane(X: Array, tolerance_m: float, trials: int = 200) -> Plane | None:
+    """Plane through points (N, 3) by RANSAC, refined on its inliers; the normal points away from the camera."""
+    if len(X) < 10:
+        return None
+    rng = np.random.default_rng(0)
+    corners = X[rng.integers(0, len(X), (trials, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    normals, corners = normals[lengths > 1e-9] / lengths[lengths > 1e-9, None], corners[lengths > 1e-9, 0]
+    sample = X[rng.permutation(len(X))[:500]]
+    distance = np.abs(sample @ normals.T - np.einsum("ij,ij->i", normals, corners))
+    best = int((distance < tolerance_m).sum(0).argmax()) if len(normals) else -1
+    if best < 0:
+        return None
+    inlier = np.abs((X - corners[best]) @ normals[best]) < tolerance_m
+    centre = X[inlier].mean(0)
+    normal = np.linalg.svd(X[inlier] - centre, full_matrices=False)[2][2]
+    normal = normal * np.sign(normal[2]) if normal[2] else normal
+    residual = (X - centre) @ normal
+    close = np.abs(residual) < tolerance_m
+    return Plane(normal, float(normal @ centre), float(close.mean()), float(np.sqrt((residual[close] ** 2).mean())))
+
+
+def common_plane(X_i: Array, X_j: Array, parameters: MatchParameters) -> Plane | None:
+    """The plane of image i's soundings if those of both images are planar (paper III.E), else None."""
+    planes = [fit_plane(X, parameters.planarity_m) for X in (X_i, X_j)]
+    if any(plane is None or plane.share < parameters.planar_share for plane in planes):
+        return None
+    return planes[0]
+
+
+def estimate(
+    x_i: Array,
+    x_j: Array,
+    laser_i: Array,
+    laser_j: Array,
+    focal_px: float,
+    parameters: MatchParameters,
+    prior: RelativePrior | None = None,
+) -> Motion | None:
+    """Motion from matches (N, 2) in slopes and the soundings (L, 3) of both images in their camera frames.
+
+    Where images share a narrow strip only, rotation and translation can hardly be told apart: navigation's motion,
+    if given as prior, then leads to the right solution, but does not count in its covariance. None when fewer than
+    `min_inliers` matches agree.
+    """
+    if len(x_i) < parameters.min_inliers:
+        return None
+    plane = common_plane(laser_i, laser_j, parameters)
+    start = None if plane is None else _from_homography(x_i, x_j, plane, focal_px, parameters)
+    if start is not None and plane is not None:
+        return _refine_on_plane(x_i, x_j, start, plane, focal_px, parameters)
+    start = _from_essential(x_i, x_j, focal_px, parameters)
+    if start is not None and prior is not None and not _compatible(start, prior):
+        start = _from_prior(x_i, x_j, prior, focal_px, parameters)
+    if start is None:
+        return None
+    return _refine_epipolar(x_i, x_j, start, laser_i, laser_j, focal_px, parameters, prior)
+
+
+class _Start(NamedTuple):
+    R_i_j: Array
+    t_i_j: Array
+    inliers: NDArray[np.intp]
+
+
+def _from_homography(x_i: Array, x_j: Array, plane: Plane, focal_px: float, parameters: MatchParameters):
+    """H = R + t n' / D by RANSAC and its decomposition (Faugeras & Lustman) nearest to the laser's plane."""
+    H, mask = cv2.findHomography(x_i, x_j, cv2.RANSAC, parameters.inlier_px / focal_px, maxIters=2000, confidence=0.999)
+    if H is None or mask.sum() < parameters.min_inliers:
+        return None
+    _, rotations, translations, normals = cv2.decomposeHomographyMat(H, np.eye(3))
+    agreement = [abs(float(plane.normal @ n.ravel())) for n in normals]
+    rotation_size = [np.linalg.norm(cv2.Rodrigues(R)[0]) for R in rotations]
+    best = min(range(len(normals)), key=lambda k: (round(1 - agreement[k], 3), rotation_size[k]))
+    sign = np.sign(float(plane.normal @ normals[best].ravel()))
+    R_j_i, t_j_i = rotations[best], translations[best].ravel() * sign * plane.offset
+    return _Start(R_j_i.T, -R_j_i.T @ t_j_i, np.flatnonzero(mask.ravel()))
+
+
+def _from_essential(x_i: Array, x_j: Array, focal_px: float, parameters: MatchParameters):
+    """Essential matrix by RANSAC and the decomposition that puts the points in front of both cameras."""
+    E, mask = cv2.findEssentialMat(
+        x_i, x_j, np.eye(3), cv2.RANSAC, prob=0.9999, threshold=parameters.inlier_px / focal_px, maxIters=3000
+    )
+    if E is None or E.shape != (3, 3) or mask.sum() < parameters.min_inliers:
+        return None
+    _, R_j_i, t_j_i, mask = cv2.recoverPose(E, x_i, x_j, np.eye(3), mask=mask)
+    inliers = np.flatnonzero(mask.ravel())
+    if len(inliers) < parameters.min_inliers:
+        return None
+    return _Start(R_j_i.T, -R_j_i.T @ t_j_i.ravel(), inliers)
+
+
+def _compatible(start: _Start, prior: RelativePrior) -> bool:
+    """Rotation and direction of the translation within three sigma of navigation's."""
+    length = float(np.linalg.norm(prior.t_i_j))
+    off = _log(prior.R_i_j.T @ start.R_i_j, prior.R_i_j.T @ (start.t_i_j * length - prior.t_i_j))
+    return float(off @ np.linalg.solve(prior.covariance, off)) < 3**2 * 6
+
+
+def _from_prior(x_i: Array, x_j: Array, prior: RelativePrior, focal_px: float, parameters: MatchParameters):
+    """Navigation's own motion as the start, with the matches that lie as near its epipolar lines as it is sure."""
+    length = max(float(np.linalg.norm(prior.t_i_j)), 1e-9)
+    blur = float(np.sqrt(np.trace(prior.covariance[:3, :3]) + np.trace(prior.covariance[3:, 3:]) / length**2))
+    distance = np.abs(sampson(x_i, x_j, prior.R_i_j, prior.t_i_j))
+    inliers = np.flatnonzero(distance < parameters.inlier_px / focal_px + blur)
+    if len(inliers) < parameters.min_inliers:
+        return None
+    return _Start(prior.R_i_j, prior.t_i_j / length, inliers)
+
+
+def _log(R: Array, v: Array) -> Array:
+    return np.concatenate([Rotation.from_matrix(R).as_rotvec(), v])
+
+
+def _moved(start_R: Array, start_t: Array, step: Array) -> tuple[Array, Array]:
+    return start_R @ Rotation.from_rotvec(step[:3]).as_matrix(), start_t + start_R @ step[3:]
+
+
+def _homogeneous(x: Array) -> Array:
+    return np.column_stack([x, np.ones(len(x))])
+
+
+def _thin(inliers: NDArray[np.intp]) -> NDArray[np.intp]:
+    return inliers[:: max(1, len(inliers) // _MAX_MATCHES)]
+
+
+def _refine_on_plane(
+    x_i: Array, x_j: Array, start: _Start, plane: Plane, focal_px: float, parameters: MatchParameters
+) -> Motion | None:
+    """Least squares of the transfer over the laser's plane; relief about the plane counts as noise of the match."""
+    relief_px = plane.rms_m / plane.offset**2 * np.linalg.norm(start.t_i_j) * focal_px
+    sigma = float(np.hypot(_PIXEL_SIGMA, relief_px)) / focal_px
+
+    def transfer(step: Array, chosen: NDArray[np.intp]) -> Array:
+        R, t = _moved(start.R_i_j, start.t_i_j, step)
+        ground = _homogeneous(x_i[chosen])
+        ground = ground * (plane.offset / (ground @ plane.normal))[:, None]
+        X_j = (ground - t) @ R
+        return ((X_j[:, :2] / X_j[:, 2:]) - x_j[chosen]) / sigma
+
+    chosen = _thin(start.inliers)
+    solution = least_squares(lambda step: transfer(step, chosen).ravel(), np.zeros(6), loss="huber", f_scale=2.0)
+    R, t = _moved(start.R_i_j, start.t_i_j, solution.x)
+    distance = np.linalg.norm(transfer(solution.x, np.arange(len(x_i))), axis=1) * sigma * focal_px
+    inliers = np.flatnonzero(distance < parameters.inlier_px)
+    if len(inliers) < parameters.min_inliers:
+        return None
+    # The plane's own offset scales the translation: its error adds along it.
+    scale_sigma = plane.rms_m / plane.offset / 3
+    along = R.T @ t * scale_sigma
+    covariance = _covariance(solution.jac, solution.fun)
+    covariance[3:, 3:] += np.outer(along, along)
+    return Motion(R, t, covariance, inliers, "homography", True, scale_sigma)
+
+
+def _refine_epipolar(
+    x_i: Array,
+    x_j: Array,
+    start: _Start,
+    laser_i: Array,
+    laser_j: Array,
+    focal_px: float,
+    parameters: MatchParameters,
+    prior: RelativePrior | None,
+) -> Motion | None:
+    """Least squares of the Sampson distance for direction and rotation, with the laser's scale."""
+    R, t, inliers = start.R_i_j, start.t_i_j, start.inliers
+    solution = None
+    for _ in range(2):  # again, with the inliers of the better motion
+        solution = _minimise_sampson(x_i[_thin(inliers)], x_j[_thin(inliers)], R, t, focal_px, prior)
+        R, t = _moved(R, t, solution.x)
+        inliers = np.flatnonzero(np.abs(sampson(x_i, x_j, R, t)) * focal_px < parameters.inlier_px)
+        if len(inliers) < parameters.min_inliers:
+            return None
+    assert solution is not None
+    depth_i, depth_j = depths(x_i[inliers], x_j[inliers], R, t)
+    inliers, depth_i, depth_j = (a[(depth_i > 0) & (depth_j > 0)] for a in (inliers, depth_i, depth_j))
+    if len(inliers) < parameters.min_inliers:
+        return None
+    scale, scale_sigma = laser_scale([(x_i[inliers], depth_i, laser_i), (x_j[inliers], depth_j, laser_j)])
+    metric = bool(np.isfinite(scale))
+    covariance = _epipolar_covariance(solution, scale_sigma if metric else _UNIT_LENGTH_SIGMA, prior is not None)
+    if metric:
+        t = t * scale
+        covariance[3:] *= scale
+        covariance[:, 3:] *= scale
+    return Motion(R, t, covariance, inliers, "essential", metric, scale_sigma)
+
+
+def _minimise_sampson(x_i: Array, x_j: Array, R: Array, t: Array, focal_px: float, prior: RelativePrior | None):
+    """scipy's result for the step (6,) from (R, t); the last rows hold the length of t and, if given, the prior."""
+    sigma = _PIXEL_SIGMA / focal_px
+    length = 1.0 if prior is None else float(np.linalg.norm(prior.t_i_j))
+    whiten = None if prior is None else np.linalg.cholesky(np.linalg.inv(prior.covariance)).T
+
+    def residuals(step: Array) -> Array:
+        R_step, t_step = _moved(R, t, step)
+        rows = np.append(sampson(x_i, x_j, R_step, t_step) / sigma, np.log(np.linalg.norm(t_step)) / _UNIT_LENGTH_SIGMA)
+        if prior is None or whiten is None:
+            return rows
+        off = _log(prior.R_i_j.T @ R_step, prior.R_i_j.T @ (t_step * length - prior.t_i_j))
+        return np.append(rows, whiten @ off)
+
+    return least_squares(residuals, np.zeros(6), loss="huber", f_scale=2.0)
+
+
+def _epipolar_covariance(solution: Any, scale_sigma: float, with_prior: bool) -> Array:
+    """Covariance for a translation of unit length: the rows of the prior left out, that of the length exchanged."""
+    rows = len(solution.fun) - (6 if with_prior else 0)
+    jacobian, residual = solution.jac[:rows].copy(), solution.fun[:rows]
+    jacobian[-1] *= _UNIT_LENGTH_SIGMA / scale_sigma
+    return _covariance(jacobian, residual)
+
+
+def _covariance(jacobian: Array, residual: Array) -> Array:
+    """(6, 6), never better than the residuals say: scaled up by their variance when above 1.
+
+    A direction that the matches leave open gets a sigma of 1 (radian, or length of the translation).
+    """
+    degrees = max(1, len(residual) - 6)
+    variance = max(1.0, float((np.clip(residual, -3, 3) ** 2).sum() / degrees))
+    return np.linalg.inv(jacobian.T @ jacobian + np.eye(6)) * variance
+
+
+def sampson(x_i: Array, x_j: Array, R_i_j: Array, t_i_j: Array) -> Array:
+    """Signed Sampson distance (N,) in slopes of matches (N, 2) from the epipolar geometry of a motion."""
+    t = t_i_j / np.linalg.norm(t_i_j)
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    E = (cross @ R_i_j).T  # x_j' E x_i = 0
+    p_i, p_j = _homogeneous(x_i), _homogeneous(x_j)
+    line_j, line_i = p_i @ E.T, p_j @ E
+    norm = np.sqrt((line_j[:, :2] ** 2).sum(1) + (line_i[:, :2] ** 2).sum(1))
+    return np.einsum("ij,ij->i", p_j, line_j) / np.maximum(norm, 1e-12)
+
+
+def depths(x_i: Array, x_j: Array, R_i_j: Array, t_i_j: Array) -> tuple[Array, Array]:
+    """Depths Z (N,), (N,) in both cameras where the rays of each match come closest; nan for parallel rays."""
+    d_i, d_j = _homogeneous(x_i), _homogeneous(x_j) @ R_i_j.T
+    a, b, c = (d_i**2).sum(1), (d_i * d_j).sum(1), (d_j**2).sum(1)
+    e, f = d_i @ t_i_j, d_j @ t_i_j
+    determinant = a * c - b * b
+    safe = np.where(determinant > 1e-12 * a * c, determinant, np.nan)
+    return (c * e - b * f) / safe, (b * e - a * f) / safe
+
+
+def laser_scale(views: list[tuple[Array, Array, Array]]) -> tuple[float, float]:
+    """Scale of a motion and its relative sigma from (slopes (N, 2), depths (N,), soundings (L, 3)) of each image.
+
+    The paper takes the one feature nearest to a laser point; here every feature within a small angle of soundings
+    votes with the logarithm of the depth ratio, and the weighted median decides. nan, nan where there are too few.
+    """
+    logs, weights = [np.zeros(0)], [np.zeros(0)]
+    for x, depth, soundings in views:
+        if len(soundings) and len(x):
+            slopes = soundings[:, :2] / soundings[:, 2:]
+            distance, nearest = KDTree(slopes).query(x, k=min(4, len(slopes)), distance_upper_bound=_SCALE_RADIUS)
+            distance, nearest = distance.reshape(len(x), -1), nearest.reshape(len(x), -1)
+            near = np.isfinite(distance[:, -1]) & (depth > 0)
+            laser_depth = np.median(soundings[nearest[near], 2], axis=1)
+            logs.append(np.log(laser_depth / depth[near]))
+            weights.append(1 / (0.005**2 + (0.3 * distance[near, 0]) ** 2))
+    ratio, weight = np.concatenate(logs), np.concatenate(weights)
+    if len(ratio) < _MIN_SCALE_FEATURES:
+        return float("nan"), float("nan")
+    median = _weighted_median(ratio, weight)
+    spread = 1.4826 * _weighted_median(np.abs(ratio - median), weight)
+    effective = weight.sum() ** 2 / (weight**2).sum()
+    return float(np.exp(median)), float(max(spread, 0.002) * 1.2533 / np.sqrt(effective) + 5e-4)
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values)
+    cumulative = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(cumulative, cumulative[-1] / 2)])

@@ -1,0 +1,64 @@
+"""Points of the seabed from matches between two images whose poses are known (source 2, image matching)."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.calibration import Camera
+from .camera import rays
+from .navigation import Poses
+
+Array = NDArray[Any]
+
+_MATCH_SIGMA_PX = 0.5
+_MAX_GAP_PX = 4.0
+_MIN_PARALLAX = 0.02  # radians; below it depth is little more than a guess
+
+
+class TiePoints(NamedTuple):
+    """Triangulated matches.
+
+    Attributes
+    ----------
+    X_local : (N, 3) metres.
+    sigma_m : (N,) 1-sigma of the elevation from the matches' own noise.
+    common_sigma_m : (N,) 1-sigma that the points of the pair share, from the error of the pair's motion.
+    """
+
+    X_local: Array
+    sigma_m: Array
+    common_sigma_m: Array
+
+
+def triangulate(
+    camera: Camera, uv_i: Array, uv_j: Array, poses: Poses, i: int, j: int, motion_covariance: Array
+) -> TiePoints:
+    """Points midway where the rays of matches (M, 2) in pixels pass each other; rays that miss are left out.
+
+    motion_covariance : (6, 6) of the pair's motion, see `motion.Motion`.
+    """
+    (o_i, d_i), (o_j, d_j) = (_local_rays(camera, uv, poses, k) for uv, k in ((uv_i, i), (uv_j, j)))
+    between, cosine = o_j - o_i, np.einsum("nk,nk->n", d_i, d_j)
+    along_i, along_j = np.einsum("nk,nk->n", between, d_i), np.einsum("nk,nk->n", between, d_j)
+    sine_squared = np.maximum(1 - cosine**2, 1e-12)
+    range_i = (along_i - cosine * along_j) / sine_squared
+    range_j = (cosine * along_i - along_j) / sine_squared
+    P_i, P_j = o_i + range_i[:, None] * d_i, o_j + range_j[:, None] * d_j
+    gap_px = np.linalg.norm(P_i - P_j, axis=1) / np.maximum(range_i, 1e-6) * camera.fx
+    parallax = np.sqrt(sine_squared)
+    keep = (range_i > 0) & (range_j > 0) & (gap_px < _MAX_GAP_PX) & (parallax > _MIN_PARALLAX)
+    distance, parallax = range_i[keep], parallax[keep]
+    angle_sigma = _MATCH_SIGMA_PX * np.sqrt(2) / camera.fx
+    turn, shift = (np.sqrt(np.trace(motion_covariance[s, s]) / 3) for s in (slice(0, 3), slice(3, 6)))
+    return TiePoints(
+        X_local=(P_i[keep] + P_j[keep]) / 2,
+        sigma_m=distance * angle_sigma / parallax,
+        common_sigma_m=np.hypot(distance * turn, shift) / parallax,
+    )
+
+
+def _local_rays(camera: Camera, uv: Array, poses: Poses, k: int) -> tuple[Array, Array]:
+    found = rays(camera, uv)
+    R = poses.R_local_camera[k]
+    return found.origin @ R.T + poses.C_local[k], found.direction @ R.T

@@ -1,0 +1,88 @@
+import hashlib
+from pathlib import Path
+
+import cv2
+import fsspec
+import numpy as np
+import pytest
+from PIL import Image
+from seamosaic.catalog.images import UnreadableImage, decode, read_image
+from seamosaic.schemas.calibration import Camera
+
+CAMERA = Camera(model="brown", width=96, height=64, fx=100, fy=100, cx=47.5, cy=31.5)
+
+
+def encoded(suffix: str, picture: np.ndarray) -> bytes:
+    done, content = cv2.imencode(suffix, picture)
+    assert done
+    return content.tobytes()
+
+
+@pytest.fixture
+def smooth() -> np.ndarray:
+    noise = np.random.default_rng(1).integers(0, 255, (64, 96, 3), np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 3)
+
+
+def test_an_image_and_its_digest(tmp_path: Path, smooth: np.ndarray) -> None:
+    content = encoded(".jpg", smooth)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.jpg").write_bytes(content)
+    read = read_image(str(tmp_path), "images/a.jpg", CAMERA)
+    assert read.sha256 == hashlib.sha256(content).hexdigest()
+    assert read.bgr.shape == (64, 96, 3)
+    assert read.bgr.dtype == np.uint8
+    error = np.abs(read.bgr.astype(float) - smooth).mean()
+    assert 0 < error < 6  # a JPEG: close, in the order blue green red, but not the same
+
+
+def test_from_memory(smooth: np.ndarray) -> None:
+    fs = fsspec.filesystem("memory")
+    fs.pipe_file("/decode/a.png", encoded(".png", smooth))
+    np.testing.assert_array_equal(read_image("memory://decode", "a.png", CAMERA).bgr, smooth)
+    fs.rm("/decode", recursive=True)
+
+
+def test_sixteen_bits_and_grey(smooth: np.ndarray) -> None:
+    deep = encoded(".png", smooth.astype(np.uint16) * 257)
+    np.testing.assert_array_equal(decode(deep, CAMERA), smooth)
+    grey = decode(encoded(".png", smooth[..., 1]), CAMERA)
+    for channel in range(3):
+        np.testing.assert_array_equal(grey[..., channel], smooth[..., 1])
+    deep_grey = decode(encoded(".png", smooth[..., 1].astype(np.uint16) * 257), CAMERA)
+    np.testing.assert_array_equal(deep_grey, grey)
+    np.testing.assert_array_equal(decode(encoded(".tif", smooth), CAMERA), smooth)
+
+
+def test_exif_rotation_is_not_applied(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (96, 64)).save(tmp_path / "a.jpg", exif=exif)
+    assert read_image(str(tmp_path), "a.jpg", CAMERA).bgr.shape == (64, 96, 3)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+@pytest.mark.parametrize("share", [0, 0.01, 0.5, 0.98])
+def test_a_truncated_file_is_refused(tmp_path: Path, smooth: np.ndarray, suffix: str, share: float) -> None:
+    content = encoded(suffix, smooth)
+    (tmp_path / "a").write_bytes(content[: int(share * len(content))])
+    with pytest.raises(UnreadableImage) as caught:
+        read_image(str(tmp_path), "a", CAMERA)
+    assert caught.value.reason.startswith("file is")
+
+
+def test_damage_inside_is_refused(smooth: np.ndarray) -> None:
+    content = bytearray(encoded(".png", smooth))
+    content[len(content) // 2 : len(content) // 2 + 400] = bytes(400)
+    with pytest.raises(UnreadableImage, match="cannot be decoded"):
+        decode(bytes(content), CAMERA)
+
+
+def test_another_size_is_refused(smooth: np.ndarray) -> None:
+    with pytest.raises(UnreadableImage, match="size 96x32, calibration says 96x64"):
+        decode(encoded(".jpg", smooth[:32]), CAMERA)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UnreadableImage, match="cannot be read"):
+        read_image(str(tmp_path), "nowhere.jpg", CAMERA)

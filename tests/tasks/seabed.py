@@ -1,0 +1,54 @@
+"""A simulated camera over ground with a pattern that has no symmetry, for the tests of mosaics."""
+
+from collections.abc import Callable
+
+import numpy as np
+from seamosaic.schemas.calibration import Camera
+from seamosaic.tasks import camera as cameras
+from seamosaic.tasks import rotations
+from seamosaic.tasks.mosaic import View
+
+CAMERA = Camera(
+    model="brown", width=400, height=300, fx=520.0, fy=524.0, cx=203.0, cy=146.0,
+    distortion=(-0.08, 0.03, 0.0006, -0.0005, 0.0),
+)  # fmt: skip
+
+
+def pattern(x, y):
+    """Colours (..., 3), 0..255, of the ground at map x, y less the origin: smooth, and unlike any mirror image."""
+    red = 120 + 60 * np.sin(9 * x + 2 * np.sin(3 * y)) + 50 * np.tanh(4 * (y - 0.3 * x))
+    green = 110 + 70 * np.sin(7 * y - 3 * x + 1) * np.cos(2 * x * y)
+    blue = 90 + 25 * x + 40 * np.sin(13 * (x + y))
+    return np.clip(np.stack([red, green, blue], -1), 0, 255)
+
+
+def pose(x, y, z, heading=0.0, roll=0.0, pitch=0.0, mount=(0.0, 0.0, 0.0)):
+    R = rotations.R_LOCAL_LEVEL @ rotations.R_level_vehicle(roll, pitch, heading) @ rotations.R_vehicle_camera(*mount)
+    return R, np.array([x, y, z])
+
+
+def ground_points(R, C, height: Callable, camera=CAMERA):
+    """First points (H * W, 3) of the ground that the pixels' rays meet, by small steps and then by halving."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    direction = cameras.rays(camera, np.column_stack([u.ravel(), v.ravel()]).astype(float)).direction @ R.T
+    near, step = np.zeros(len(direction)), 0.02
+    going = np.ones(len(direction), bool)
+    for _ in range(int(6 / step)):
+        X = C + direction * (near + step)[:, None]
+        going &= X[:, 2] > height(X[:, 0], X[:, 1])
+        near[going] += step
+    far = near + step
+    for _ in range(20):
+        middle = (near + far) / 2
+        X = C + direction * middle[:, None]
+        above = X[:, 2] > height(X[:, 0], X[:, 1])
+        near, far = np.where(above, middle, near), np.where(above, far, middle)
+    return C + direction * near[:, None]
+
+
+def photograph(R, C, height, number, origin=(0.0, 0.0), camera=CAMERA, paint=pattern):
+    """The image that a camera takes; origin is where the pattern begins."""
+    X = ground_points(R, C, height, camera)
+    image = paint(X[:, 0] - origin[0], X[:, 1] - origin[1]).reshape(camera.height, camera.width, 3)
+    erase = np.zeros(image.shape[:2], bool)
+    return View(np.rint(image).astype(np.uint8), erase, camera, R, C, number)

@@ -1,0 +1,212 @@
+"""Images of a pattern on simulated ground, put back on the map."""
+
+import numpy as np
+import pytest
+from seamosaic.tasks import grids, mosaic
+from seamosaic.tasks.frames import LocalAffine, MapFrame
+from seamosaic.tasks.grids import Grid
+from seamosaic.tasks.terrain import Terrain
+
+from .seabed import CAMERA, pattern, photograph, pose
+
+SAME = LocalAffine(np.eye(3), np.zeros(3))
+CELL = 0.006
+TILE = Grid(CELL, -100, 90, 200, 180)
+
+
+def flat(x, y):
+    return 0 * x - 3.0 + 0 * y
+
+
+def rolling(x, y):
+    return -3 + 0.25 * np.sin(2.5 * x + 0.5) * np.cos(2 * y)
+
+
+def terrain_of(height, tile=TILE, halo_m=0.5, cell_m=0.02, local=SAME):
+    west, south, east, north = tile.bounds
+    grid = grids.grid_around((west - halo_m, south - halo_m, east + halo_m, north + halo_m), cell_m)
+    return Terrain(height(*grids.cell_centres(grid)), grid, local)
+
+
+def compose(tile, terrain, views, feather_m=0.02):
+    canvas = mosaic.start(tile, terrain, feather_m)
+    for view in views:
+        canvas = mosaic.add_view(canvas, view)
+    return mosaic.finish(canvas)
+
+
+def truth(tile, origin=(0.0, 0.0)):
+    x, y = grids.cell_centres(tile)
+    return np.moveaxis(pattern(x - origin[0], y - origin[1]), 2, 0)
+
+
+def shift_px(found, expected, mask):
+    """Displacement (x, y) in cells between two pictures, by the gradient of the expected one."""
+    gy, gx = np.gradient(expected.astype(float))
+    A = np.column_stack([gx[mask], gy[mask]])
+    return np.linalg.lstsq(A, (expected - found)[mask], rcond=None)[0]
+
+
+@pytest.mark.parametrize(
+    ("attitude", "mount", "height"),
+    [
+        ((0, 0, 0), (0, 0, 0), flat),
+        ((35, 0, 0), (0, 0, 0), flat),
+        ((-110, 3, -4), (0.4, -0.6, 0.5), rolling),
+        ((200, -5, 2), (4, 3, 90), rolling),
+    ],
+)
+def test_the_pattern_comes_back_in_its_place(attitude, mount, height):
+    heading, roll, pitch = attitude
+    view = photograph(*pose(0.1, -0.05, 0.0, heading, roll, pitch, mount), height, 7)
+    result = compose(TILE, terrain_of(height), [view])
+    error = np.abs(result.rgb - truth(TILE))[:, result.mask]
+    assert result.mask.mean() > 0.9
+    assert np.quantile(error, 0.99) < 4
+    for band in range(3):
+        shift = shift_px(result.rgb[band].astype(float), truth(TILE)[band], result.mask)
+        assert np.abs(shift).max() < 0.1
+    assert set(np.unique(result.source[result.mask])) == {7}
+    assert (result.source[~result.mask] == -1).all()
+    assert (result.rgb[:, ~result.mask] == 0).all()
+
+
+def test_the_map_is_turned_by_its_meridian_convergence():
+    frame = MapFrame("EPSG:32631", 43.04, 6.01)
+    origin = frame.map_from_local(np.zeros((1, 3)))[0]
+    tile = grids.grid_around((origin[0] - 0.5, origin[1] - 0.45, origin[0] + 0.5, origin[1] + 0.45), CELL)
+    view = photograph(*pose(0.1, -0.05, 0.0, 35), flat, 0)
+    result = compose(tile, terrain_of(flat, tile, local=frame.affine_at(origin)), [view])
+    x, y = grids.cell_centres(tile)
+    X = frame.local_from_map(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -3.0)]))
+    expected = np.moveaxis(pattern(*X[:, :2].T).reshape(*tile.shape, 3), 2, 0)
+    assert result.mask.all()
+    assert np.quantile(np.abs(result.rgb - expected), 0.99) < 4
+    # two degrees would have been seen
+    assert np.quantile(np.abs(result.rgb - truth(tile, origin)), 0.9) > 4
+
+
+def two_views(height=flat):
+    left = photograph(*pose(-0.35, 0.0, 0.0, 20), height, 3)
+    right = photograph(*pose(0.35, 0.0, 0.0, -15), height, 4)
+    return left, right
+
+
+def test_each_cell_is_of_the_closest_image_whatever_their_order():
+    left, right = two_views()
+    right = right._replace(image=np.full_like(right.image, 200))
+    left = left._replace(image=np.full_like(left.image, 100))
+    result = compose(TILE, terrain_of(flat), [left, right])
+    x, _ = grids.cell_centres(TILE)
+    assert (result.source[x < -0.01] == 3).all()
+    assert (result.source[x > 0.01] == 4).all()
+    assert (result.rgb[:, x < -0.1] == 100).all()
+    assert (result.rgb[:, x > 0.1] == 200).all()
+    # blended over a few centimetres
+    assert 4 < ((result.rgb[0, 90] > 105) & (result.rgb[0, 90] < 195)).sum() < 25
+    other = compose(TILE, terrain_of(flat), [right, left])
+    np.testing.assert_array_equal(other.source, result.source)
+    assert np.abs(other.rgb.astype(int) - result.rgb).max() <= 1
+
+
+def test_the_erased_laser_is_taken_from_the_other_image():
+    left, right = two_views()
+    left.image[:, 120:140] = 0, 255, 0
+    left.erase[:, 118:142] = True
+    result = compose(TILE, terrain_of(flat), [left, right])
+    assert np.quantile(np.abs(result.rgb - truth(TILE))[:, result.mask], 0.999) < 6
+    x, y = grids.cell_centres(TILE)
+    assert ((result.source == 4) & (x < -0.1)).sum() > 500
+    # alone, it is painted over: no green, and not far from what is there
+    alone = compose(TILE, terrain_of(flat), [left])
+    error = np.abs(alone.rgb - truth(TILE))[:, alone.mask]
+    assert error.max() < 120
+    assert np.quantile(error, 0.99) < 60
+    assert (alone.mask == compose(TILE, terrain_of(flat), [left._replace(erase=np.zeros_like(left.erase))]).mask).all()
+
+
+def wall(x, y):
+    return -3 + 0.6 * ((np.abs(x - 0.1) < 0.15) & (np.abs(y) < 0.3))
+
+
+def test_what_terrain_hides_is_taken_from_the_image_that_sees_it():
+    near = photograph(*pose(-0.5, 0.0, 0.0), wall, 0)
+    far = photograph(*pose(1.3, 0.0, 0.0, 180), wall, 1)
+    result = compose(TILE, terrain_of(wall), [near, far])
+    x, y = grids.cell_centres(TILE)
+    shadow = (x > 0.285) & (x < 0.33) & (np.abs(y) < 0.25)
+    assert (result.source[shadow] == 1).all()
+    error = np.abs(result.rgb - truth(TILE)).max(0)
+    assert np.quantile(error[shadow], 0.9) < 12
+    # beyond the shadow the nearer image serves again, and where nothing else is to be had the hidden one does
+    assert (result.source[(x > 0.37) & (x < 0.385) & (np.abs(y) < 0.2)] == 0).mean() > 0.9
+    only = compose(TILE, terrain_of(wall), [near])
+    assert only.mask[shadow].all()
+    assert np.median(np.abs(only.rgb - truth(TILE)).max(0)[shadow]) > 12
+
+
+def test_mosaics_of_tiles_are_the_mosaic():
+    views = [*two_views(rolling), photograph(*pose(0.0, 0.3, 0.1, 100, 4, 3), rolling, 9)]
+    views[0].erase[100:120] = True
+    terrain = terrain_of(rolling)
+    whole = compose(TILE, terrain, views)
+    for tile in grids.tiles(TILE, 64):
+        at = grids.window(TILE, tile)
+        west, south, east, north = tile.bounds
+        around = grids.grid_around((west - 0.3, south - 0.3, east + 0.3, north + 0.3), terrain.grid.cell_m)
+        part = grids.intersection(terrain.grid, around)
+        assert part is not None
+        window = grids.window(terrain.grid, part)
+        result = compose(tile, Terrain(terrain.elevation[window], part, SAME), views)
+        np.testing.assert_array_equal(result.rgb, whole.rgb[:, at[0], at[1]])
+        np.testing.assert_array_equal(result.source, whole.source[at])
+        np.testing.assert_array_equal(result.mask, whole.mask[at])
+
+
+def test_coarse_cells_average_pixels():
+    def stripes(x, y):
+        bright = 127 + 127 * np.sin(2 * np.pi * x / 0.02)
+        return np.stack([bright] * 3, -1) + 0 * y[..., None]
+
+    coarse = Grid(0.05, -10, 9, 20, 18)
+    view = photograph(*pose(0.0, 0.0, 0.0), flat, 0, paint=stripes)
+    result = compose(coarse, terrain_of(flat, coarse), [view])
+    assert view.image.std() > 40
+    assert result.rgb.std() < 15
+    assert abs(result.rgb.mean() - 127) < 3
+
+
+def test_holes_in_the_surface_and_images_elsewhere_leave_nothing():
+    view = photograph(*pose(0.0, 0.0, 0.0), flat, 0)
+    terrain = terrain_of(flat)
+    terrain.elevation[20:40, 30:60] = np.nan
+    result = compose(TILE, terrain, [view, view._replace(C_local=view.C_local + [50, 0, 0])])
+    x, y = grids.cell_centres(terrain.grid)
+    west, east, south, north = x[0, 30], x[0, 59], y[39, 0], y[20, 0]
+    x, y = grids.cell_centres(TILE)
+    hole = (x > west) & (x < east) & (y > south) & (y < north)
+    assert not result.mask[hole].any()
+    assert result.mask[(x < west - 0.03)].mean() > 0.95
+    nothing = compose(TILE, Terrain(np.full_like(terrain.elevation, np.nan), terrain.grid, SAME), [view])
+    assert not nothing.mask.any()
+
+
+def test_an_image_with_the_horizon_serves_below_it():
+    R, C = pose(0.0, -1.5, -1.0, 0, 0, 45)
+    view = photograph(R, C, lambda x, y: 0 * x + 0 * y - 2.0, 0)
+    result = compose(TILE, terrain_of(lambda x, y: 0 * x - 2.0), [view])
+    assert result.mask.mean() > 0.5
+    assert np.quantile(np.abs(result.rgb - truth(TILE))[:, result.mask], 0.95) < 12
+
+
+def test_paint_over_fills_from_around():
+    ramp = np.repeat(np.linspace(20, 220, CAMERA.width)[None, :, None], CAMERA.height, 0).repeat(3, 2).astype(np.uint8)
+    erase = np.zeros(ramp.shape[:2], bool)
+    erase[:, 180:200] = True
+    erase[140:160] = True
+    spoilt = np.where(erase[..., None], np.uint8(255), ramp)
+    painted = mosaic.paint_over(spoilt, erase)
+    error = np.abs(painted.astype(int) - ramp)
+    assert (error[~erase] == 0).all()
+    assert 0 < error.max() < 20
+    assert mosaic.paint_over(spoilt, np.zeros_like(erase)) is spoilt

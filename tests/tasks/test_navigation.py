@@ -1,0 +1,56 @@
+import numpy as np
+import pyproj
+from seamosaic.schemas.calibration import Mount
+from seamosaic.tasks import navigation, rotations
+from seamosaic.tasks.frames import MapFrame
+from seamosaic.tasks.navigation import NavigationPrior, Poses, VehicleState
+
+FRAME = MapFrame(pyproj.CRS("EPSG:32632").to_wkt(), 43.0, 6.5)
+
+
+def _state(heading, roll=0.0, pitch=0.0):
+    ones = np.ones(1)
+    return VehicleState(6.5 * ones, 43.0 * ones, -12.0 * ones, roll * ones, pitch * ones, heading * ones)
+
+
+def test_lever_arm_turns_with_the_heading():
+    mount = Mount(translation=(0.35, 0.12, 0.25))
+    north = navigation.camera_poses(_state(0), mount, FRAME)
+    east = navigation.camera_poses(_state(90), mount, FRAME)
+    np.testing.assert_allclose(north.C_local[0], [0.12, 0.35, -12.25], atol=1e-6)
+    np.testing.assert_allclose(east.C_local[0], [0.35, -0.12, -12.25], atol=1e-6)
+
+
+def test_camera_looks_down_and_its_top_to_the_bow():
+    poses = navigation.camera_poses(_state(90), Mount(), FRAME)
+    np.testing.assert_allclose(poses.R_local_camera[0] @ [0, 0, 1], [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(poses.R_local_camera[0] @ [0, -1, 0], [1, 0, 0], atol=1e-9)  # heading east
+
+
+def test_first_camera_without_navigation_is_level():
+    np.testing.assert_allclose(navigation.first_camera_without_navigation(Mount()), np.diag([1.0, -1, -1]), atol=1e-12)
+
+
+def _prior(seconds, drift=0.02):
+    count, R = len(seconds), rotations.R_LOCAL_LEVEL @ rotations.R_vehicle_camera(0, 0, 0)
+    C = np.column_stack([np.arange(count), np.zeros(count), np.zeros(count)])
+    return NavigationPrior(
+        poses=Poses(np.repeat(R[None], count, 0), C),
+        time_s=np.array(seconds, float),
+        sigma_horizontal=np.full(count, 0.4),
+        sigma_depth=np.full(count, 0.03),
+        sigma_attitude=np.radians(np.tile([0.27, 0.27, 0.84], (count, 1))),
+        drift_m_per_sqrt_s=drift,
+        R_camera_vehicle=rotations.R_vehicle_camera(0, 0, 0).T,
+    )
+
+
+def test_relative_uncertainty_walks_and_is_bounded_by_the_absolute():
+    near, far = (navigation.relative(_prior([0, seconds]), 0, 1) for seconds in (4, 1e6))
+    sigma_near, sigma_far = (np.sqrt(motion.covariance[3, 3]) for motion in (near, far))
+    turned = np.radians(0.84)
+    assert abs(sigma_near**2 - (0.04**2 + turned**2 + 1e-6)) < 1e-9
+    assert abs(sigma_far**2 - (2 * 0.4**2 + turned**2 + 1e-6)) < 1e-6
+    np.testing.assert_allclose(near.t_i_j, [1, 0, 0], atol=1e-12)
+    # heading is the rotation about the optical axis
+    assert abs(near.covariance[2, 2] - 2 * turned**2) < 1e-9

@@ -1,0 +1,202 @@
+"""The `seamosaic` command. Exit codes: 0 done, 1 failed, 2 invalid input."""
+
+import json
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.table import Table
+
+from ..schemas.problems import InvalidInput
+from .job import log
+
+FAILED, INVALID = 1, 2
+
+app = typer.Typer(
+    name="seamosaic",
+    help="Maps of the seabed from AUV stills, a laser cross and navigation: bathymetry, meshes and mosaics.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+_console = Console()
+_errors = Console(stderr=True)
+
+MissionArgument = Annotated[
+    str, typer.Argument(metavar="MISSION", help="Mission folder, or any URL that fsspec reads.")
+]
+ParamsOption = Annotated[Path | None, typer.Option("--params", metavar="FILE", help="YAML file of parameters.")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="One parameter, e.g. grid.cell_m=0.05; repeatable."),
+]
+
+
+@app.command()
+def run(
+    mission: MissionArgument,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="OUT", help="Products go to OUT/<mission id>/v1, v2, ...")
+    ],
+    params: ParamsOption = None,
+    set_: SetOption = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one a core.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler (tcp://...), or threads or sync.")
+    ] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log every step that is computed.")] = False,
+) -> None:
+    """Process a mission: every product of one mission folder. What was computed before is not computed again."""
+    from . import run as runner
+
+    _log_to_stderr(verbose)
+    result = runner.run(mission, out, _parameters(params, set_), scheduler, workers)
+    _print_result(result)
+
+
+@app.command()
+def check(mission: MissionArgument, params: ParamsOption = None, set_: SetOption = None) -> None:
+    """Say everything that is wrong with a mission, and what `run` would make of it."""
+    from . import check as checker
+
+    result = checker.check(mission, _parameters(params, set_))
+    checker.print_check(result, _console)
+    if not result.valid:
+        raise typer.Exit(INVALID)
+
+
+@app.command()
+def simulate(
+    scene: Annotated[
+        str, typer.Argument(metavar="SCENE", help="plane, box, pool, reef, sea, night, pairs, sand, port or demo.")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="A new folder.")],
+    seed: Annotated[int, typer.Option(help="Another seed, another seabed.")] = 0,
+    images: Annotated[int | None, typer.Option(min=1, help="How many images.")] = None,
+    width: Annotated[int | None, typer.Option(min=64, help="Width of an image, pixels; 4:3.")] = None,
+) -> None:
+    """Make a mission with its truth, in the public format."""
+    from . import simulate as simulator
+
+    path = simulator.simulate(scene, out, seed, **_overrides(images, width))
+    _console.print(f"{scene} mission with its truth in {path}")
+
+
+@app.command()
+def evaluate(
+    products: Annotated[Path, typer.Argument(metavar="PRODUCTS", help="OUT, OUT/<mission id> or OUT/<mission id>/vN.")],
+    truth: Annotated[
+        Path, typer.Option("--truth", metavar="TRUTH", help="Simulated mission, raster or LAS/LAZ cloud.")
+    ],
+) -> None:
+    """Measure products against a truth; prints one JSON object."""
+    from . import evaluate as evaluator
+
+    _console.print_json(json.dumps(evaluator.evaluate(products, truth)))
+
+
+@app.command()
+def demo(out: Annotated[Path, typer.Argument(metavar="OUT", help="A new or an earlier demo's folder.")]) -> None:
+    """Make a small mission, process it, measure it against its truth and say where to look."""
+    from . import evaluate as evaluator
+    from . import run as runner
+    from . import simulate as simulator
+
+    _log_to_stderr(False)
+    mission = out / "mission"
+    if not mission.exists():
+        _console.print("Making a small mission over a simulated reef ...")
+        simulator.simulate("demo", mission)
+    result = runner.run(str(mission), out / "products", _parameters(None, None))
+    _print_result(result)
+    measured = evaluator.evaluate(result.path, mission)
+    _console.print("Against the simulation's truth:")
+    _console.print_json(json.dumps(measured))
+    _console.print(f"\nLook at [bold]{result.path / 'report.html'}[/bold] in a browser,")
+    _console.print(f"and open {result.path / 'bathymetry.tif'} and {result.path / 'mosaic.tif'} in QGIS.")
+
+
+def _overrides(images: int | None, width: int | None) -> dict[str, Any]:
+    given = {"images": images, "width": width}
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def _parameters(params: Path | None, overrides: list[str] | None):
+    from ..schemas.problems import Problem
+    from ..schemas.yaml_input import load_parameters
+
+    text = None
+    if params is not None:
+        try:
+            text = params.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            problem = Problem("--params", None, "", str(error), "a YAML file of parameters", "Correct the path.")
+            raise InvalidInput([problem]) from error
+    return load_parameters(text, str(params), overrides or [])
+
+
+def _print_result(result: Any) -> None:
+    quality = result.quality
+    table = Table(title=f"{quality.mission.id}: {'new version' if result.new else 'nothing changed,'} {result.path}")
+    table.add_column("step")
+    for name in ("computed", "reused", "core seconds"):
+        table.add_column(name, justify="right")
+    for step in result.steps:
+        table.add_row(step.name, str(step.count_computed), str(step.count_reused), f"{step.core_seconds:.1f}")
+    _console.print(table)
+    figures = Table(show_header=False, box=None)
+    for name, value in _figures(quality):
+        figures.add_row(name, value)
+    _console.print(figures)
+    for warning in quality.warnings:
+        _console.print(f"[yellow]warning[/yellow] {warning}")
+
+
+def _figures(quality: Any):
+    counts = quality.mission.images.by_status
+    yield "images", f"{quality.mission.images.total}: " + ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items()))
+    if quality.soundings is not None:
+        yield "laser soundings", f"{quality.soundings.count}"
+    if quality.pairs is not None:
+        yield "image pairs", f"{quality.pairs.linked} linked of {quality.pairs.tried} tried"
+    if quality.bathymetry is not None:
+        yield "bathymetry", f"{quality.bathymetry.area_m2:.1f} m², cells of {quality.bathymetry.cell_m:g} m"
+    if quality.mosaic is not None:
+        yield "mosaic", f"{quality.mosaic.area_m2:.1f} m², pixels of {1e3 * quality.mosaic.cell_m:g} mm"
+
+
+def _log_to_stderr(verbose: bool) -> None:
+    if sys.stderr.isatty():
+        handler: logging.Handler = RichHandler(console=_errors, show_path=False)
+    else:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    log.handlers = [handler]
+    log.setLevel(logging.DEBUG if verbose else logging.INFO)
+
+
+def main() -> None:
+    """Entry point: every error that a user can cause becomes a message and an exit code."""
+    try:
+        app()
+    except InvalidInput as error:
+        from .check import print_problems
+
+        print_problems(error.problems, "", _errors)
+        sys.exit(INVALID)
+    except KeyboardInterrupt:
+        _errors.print("Stopped. Run the same command again to go on from here.")
+        sys.exit(FAILED)
+    except (RuntimeError, OSError) as error:
+        log.debug("failed", exc_info=True)
+        _errors.print(f"[red]failed[/red] {error}")
+        sys.exit(FAILED)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""Per image: decoded once; laser soundings, features and colour statistics into the store."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ..catalog.images import UnreadableImage, read_image
+from ..schemas.calibration import Laser
+from ..schemas.mission import Role
+from ..tasks import camera, colour, cross, features, laser, triangulation
+from .job import Done, Job, Made, code_version, log, once, stage
+
+STEP = "extract"
+VERSION = code_version(camera, colour, cross, features, laser, triangulation)
+
+
+class ImageTask(NamedTuple):
+    """An image to extract: its row in the frames table, path, digest and role."""
+
+    row: int
+    path: str
+    sha256: str
+    role: Role
+
+
+def extract_batch(job: Job, batch: Sequence[ImageTask]) -> list[Done]:
+    """Extract some images; a bad one gives an entry that says why, never an exception."""
+    cv2.setNumThreads(1)
+    return [_extract(job, image) for image in batch]
+
+
+def _extract(job: Job, image: ImageTask) -> Done:
+    calibration = job.calibration
+    light = calibration.laser if image.role != "texture" else None
+    parameters = [
+        image.role,
+        *stage(calibration.camera, job.parameters.laser, job.parameters.features),
+        light.model_dump(mode="json") if light else None,
+    ]
+
+    def make() -> Made:
+        try:
+            decoded = read_image(job.mission_url, image.path, calibration.camera)
+            if decoded.sha256 != image.sha256:
+                raise UnreadableImage("the file changed while the mission was being processed")
+        except (UnreadableImage, OSError) as error:
+            log.warning("mission=%s step=%s image=%s rejected: %s", job.mission_id, STEP, image.path, error)
+            return Made({}, {"status": f"rejected: {error}", "soundings": 0, "features": 0})
+        return _measure(job, image.role, light, decoded.bgr)
+
+    return once(job, STEP, VERSION, [image.sha256], parameters, make)
+
+
+def _measure(job: Job, role: Role, light: Laser | None, bgr: np.ndarray) -> Made:
+    arrays, reason = {}, ""
+    erase = np.zeros(bgr.shape[:2], bool)
+    count, range_m, sigma_m, halfwidth_px = 0, None, None, 0.0
+    if light is not None:
+        found = triangulation.sound(bgr, job.calibration.camera, light, job.parameters.laser)
+        soundings, reason, halfwidth_px = found.soundings, found.reason, float(found.halfwidth_px)
+        count = len(soundings.uv)
+        if count:
+            range_m, sigma_m = float(np.median(soundings.X_camera[:, 2])), float(np.median(soundings.sigma_m))
+        erase = laser.mask(bgr.shape[:2], found.line_uv, found.halfwidth_px)
+        arrays |= {
+            "laser_uv": soundings.uv,
+            "laser_arm": soundings.arm,
+            "laser_X": soundings.X_camera,
+            "laser_sigma": soundings.sigma_m,
+            "line_uv": found.line_uv,
+        }
+    feature_count = 0
+    if role != "laser":
+        grey = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+        points = features.detect(grey, erase, job.parameters.features)
+        feature_count = len(points.uv)
+        arrays |= {
+            "feature_uv": points.uv,
+            "feature_descriptors": points.descriptors,
+            "thumbnail": colour.thumbnail(bgr, erase),
+        }
+    info = {
+        "status": "",
+        "reason": reason,
+        "soundings": count,
+        "range_m": range_m,
+        "sigma_m": sigma_m,
+        "halfwidth_px": halfwidth_px,
+        "features": feature_count,
+    }
+    return Made(arrays, info)

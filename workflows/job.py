@@ -1,0 +1,113 @@
+"""What every task of a run needs to know, and how a step's result is found or made."""
+
+import hashlib
+import inspect
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..catalog.store import Entry, Store, digest
+from ..schemas.base import Model
+from ..schemas.calibration import Calibration
+from ..schemas.parameters import Parameters
+
+log = logging.getLogger("seamosaic")
+
+
+class Job(NamedTuple):
+    """A mission being processed; small and picklable, it goes with every task."""
+
+    mission_url: str
+    mission_id: str
+    store: Store
+    calibration: Calibration
+    parameters: Parameters
+
+
+class Done(NamedTuple):
+    """One step's result as it travels through the graph: where it is, not what it is.
+
+    Attributes
+    ----------
+    step, key : of the store. computed : False if the store had it. seconds : of the computation, when it was made.
+    info : the entry's small record.
+    """
+
+    step: str
+    key: str
+    computed: bool
+    seconds: float
+    info: dict[str, Any]
+
+
+class Made(NamedTuple):
+    """What a step computes: arrays and a small record."""
+
+    arrays: Mapping[str, NDArray]
+    info: Mapping[str, Any]
+
+
+def code_version(*modules: ModuleType) -> str:
+    """Digest of the modules' source: a step's results are stale when the code that makes them changed."""
+    text = "".join(inspect.getsource(module) for module in modules)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def stage(*models: Model) -> list[Any]:
+    """What a step reads of the parameters or the calibration, as it enters the digest."""
+    return [model.model_dump(mode="json") for model in models]
+
+
+def array_digest(*arrays: NDArray) -> str:
+    """SHA-256 of the bytes, shapes and types of arrays."""
+    sha = hashlib.sha256()
+    for array in arrays:
+        sha.update(f"{array.dtype.str}{array.shape}".encode())
+        sha.update(np.ascontiguousarray(array).tobytes())
+    return sha.hexdigest()
+
+
+def once(
+    job: Job,
+    step: str,
+    version: str,
+    inputs: Sequence[str],
+    parameters: Any,
+    make: Callable[[], Made],
+    compress: bool = False,
+) -> Done:
+    """The stored result of a step, made now if the store does not have it."""
+    key = digest(step, version, inputs, parameters)
+    entry = job.store.get(step, key)
+    if entry is not None:
+        return Done(step, key, False, float(entry.info["seconds"]), entry.info)
+    started = time.process_time()
+    made = make()
+    seconds = time.process_time() - started
+    info = {**made.info, "seconds": round(seconds, 4)}
+    job.store.put(step, key, made.arrays, info, compress)
+    log.debug("mission=%s step=%s key=%s seconds=%.3f", job.mission_id, step, key[:12], seconds)
+    return Done(step, key, True, seconds, info)
+
+
+def load(job: Job, step: str, key: str) -> Entry:
+    """A result that an earlier step stored.
+
+    Raises
+    ------
+    LostEntry
+        If it is gone or damaged; a rerun makes it again.
+    """
+    entry = job.store.get(step, key)
+    if entry is None:
+        raise LostEntry(f"{job.store.path(step, key)} is gone or damaged; run again to make it anew")
+    return entry
+
+
+class LostEntry(RuntimeError):
+    """A stored result vanished during the run."""

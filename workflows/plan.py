@@ -1,0 +1,143 @@
+"""What a mission's frames table says before anything is computed: poses by navigation, pairs, batches."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray
+
+from ..catalog.missions import OpenedMission
+from ..schemas.parameters import Parameters
+from ..tasks import navigation, pairs, rotations
+from ..tasks.frames import MapFrame
+from ..tasks.navigation import NavigationPrior, Poses
+from .extract import ImageTask
+from .match import PairTask
+
+# Height above the seabed that is assumed where neither altimeter nor laser tells (paper V: 3 m)
+ASSUMED_RANGE_M = 3.0
+_SEQUENTIAL_REACH = 3
+
+
+class Plan(NamedTuple):
+    """A mission ready to be processed.
+
+    Attributes
+    ----------
+    images : all that are not rejected.
+    frame : local and map. prior : navigation, None without. range_m : (n,) height above the seabed as far as known.
+    R_first : R_local_camera (3, 3) of the first image of a mission without navigation.
+    """
+
+    images: tuple[ImageTask, ...]
+    frame: MapFrame
+    prior: NavigationPrior | None
+    range_m: np.ndarray
+    R_first: np.ndarray
+
+
+def plan(opened: OpenedMission, parameters: Parameters) -> Plan:
+    """Poses by navigation and the list of images to extract."""
+    frames = opened.frames
+    status, role = frames["status"].values, frames["role"].values
+    images = tuple(
+        ImageTask(k, str(frames["image"].values[k]), str(frames["sha256"].values[k]), role[k])
+        for k in range(frames.sizes["image"])
+        if not status[k]
+    )
+    mount = opened.calibration.mount
+    frame = _map_frame(opened)
+    prior = None if opened.crs is None else _prior(frames, frame, opened, parameters)
+    altitude = frames["altitude"].values.astype(float)
+    known = altitude[np.isfinite(altitude)]
+    range_m = np.where(np.isfinite(altitude), altitude, np.median(known) if len(known) else ASSUMED_RANGE_M)
+    R_first = navigation.first_camera_without_navigation(mount)
+    return Plan(images, frame, prior, np.maximum(range_m, 0.1), R_first)
+
+
+def _map_frame(opened: OpenedMission) -> MapFrame:
+    """The local frame's origin: the mission's middle, rounded so that one image more does not move it much."""
+    if opened.crs is None:
+        return MapFrame(None)
+    place = [round(float(np.nanmedian(opened.frames[name].values)), 4) for name in ("latitude", "longitude")]
+    return MapFrame(opened.crs, *place)
+
+
+def _prior(frames: xarray.Dataset, frame: MapFrame, opened: OpenedMission, parameters: Parameters) -> NavigationPrior:
+    def column(name: str) -> np.ndarray:
+        return frames[name].values.astype(float)
+
+    names = "longitude", "latitude", "elevation", "roll", "pitch", "heading"
+    state = navigation.VehicleState(*(column(name) for name in names))
+    complete = np.asarray(np.isfinite(np.column_stack(state)).all(1))
+    mount = opened.calibration.mount
+    safe = navigation.VehicleState(*(np.where(complete, values, 0.0) for values in state))
+    poses = navigation.camera_poses(safe, mount, frame)
+    C = np.where(complete[:, None], poses.C_local, np.nan)
+    time = frames["time"].values
+    return NavigationPrior(
+        poses=Poses(poses.R_local_camera, C),
+        time_s=(time - time[0]) / np.timedelta64(1, "s"),
+        sigma_horizontal=column("sigma_horizontal"),
+        sigma_depth=column("sigma_depth"),
+        sigma_attitude=np.radians(np.column_stack([column(f"sigma_{n}") for n in ("roll", "pitch", "heading")])),
+        drift_m_per_sqrt_s=parameters.adjust.drift_m_per_sqrt_s,
+        R_camera_vehicle=rotations.R_vehicle_camera(*mount.rotation).T,
+    )
+
+
+def first_pairs(made: Plan, opened: OpenedMission, parameters: Parameters) -> list[PairTask]:
+    """Pairs to match: by navigation's footprints, or each image with the next few where there is no navigation."""
+    rows = np.array([image.row for image in made.images if image.role != "laser"], int)
+    if made.prior is None:
+        found = pairs.sequential(len(rows), _SEQUENTIAL_REACH)
+        return [PairTask(int(rows[a]), int(rows[b]), None, None, ASSUMED_RANGE_M, 0.0) for a, b in found.images]
+    margin = _margin(made.prior)
+    outlines = pairs.footprints(opened.calibration.camera, made.prior.poses, made.range_m)
+    found = overlapping(outlines, rows, margin, parameters)
+    tasks = []
+    for i, j in found:
+        prior = navigation.relative(made.prior, i, j)
+        spread = 2 * float(np.sqrt(prior.covariance[3:, 3:].trace())) + 0.05 * made.range_m[i]
+        tasks.append(PairTask(i, j, _two(made.prior.poses, i, j), prior, float(made.range_m[i]), spread))
+    return tasks
+
+
+def loop_pairs(
+    made: Plan,
+    opened: OpenedMission,
+    parameters: Parameters,
+    poses: Poses,
+    range_m: np.ndarray,
+    known: Sequence[tuple[int, int]],
+) -> list[PairTask]:
+    """Without navigation: the pairs that overlap by the chained poses and were not tried yet."""
+    rows = np.array([image.row for image in made.images if image.role != "laser"], int)
+    outlines = pairs.footprints(opened.calibration.camera, poses, range_m)
+    tried = set(known)
+    found = overlapping(outlines, rows, np.full(len(range_m), 0.1 * float(np.median(range_m))), parameters)
+    return [PairTask(i, j, None, None, float(range_m[i]), 0.0) for i, j in found if (i, j) not in tried]
+
+
+def overlapping(
+    outlines: np.ndarray, rows: np.ndarray, margin_m: np.ndarray, parameters: Parameters
+) -> list[tuple[int, int]]:
+    """Rows (i, j) of the images whose footprints overlap."""
+    p = parameters.match
+    found = pairs.overlapping(outlines[rows], margin_m[rows], p.min_overlap, p.max_pairs_per_image)
+    return [(int(rows[a]), int(rows[b])) for a, b in found.images]
+
+
+def _margin(prior: NavigationPrior) -> np.ndarray:
+    """How far a footprint may be from where navigation has it, relative to those of neighbouring lines, (n,) m."""
+    drift = prior.drift_m_per_sqrt_s * np.sqrt(max(float(prior.time_s[-1]), 1.0))
+    return np.minimum(prior.sigma_horizontal, drift) / 2
+
+
+def _two(poses: Poses, i: int, j: int) -> Poses:
+    return Poses(poses.R_local_camera[[i, j]], poses.C_local[[i, j]])
+
+
+def batches(items: Sequence, size: int) -> list[Sequence]:
+    """Items in runs of `size`."""
+    return [items[start : start + size] for start in range(0, len(items), size)]
