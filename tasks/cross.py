@@ -81,9 +81,12 @@ def segment(points: LaserPoints, shape: tuple[int, int], sheets: Sheets, inverse
         return Cross(None, arm)
     width = float(np.median(points.width_px))
     centre = find_centre(points, shape, sheets.meeting_uv, _CENTRE_TOLERANCE_SIGMAS * width)
-    apart = _APART_SIGMAS * width
+    # also farther than laser.linked reaches
+    apart = max(_APART_SIGMAS * width, 8.0 * points.step_px)
     clear = (separation_px(sheets) > apart) & (laser.distance_in_row(points) > apart)
     clear &= _believable(sheets.inverse_depth, inverse_range).any(axis=1)
+    if not clear.any():
+        return Cross(centre, arm)
     fragment = _fragments(points, shape, clear, sheets)
     start = _start(centre, sheets, clear, inverse_range)
     arm[clear] = _label(fragment[clear], sheets.inverse_depth[clear], sheets.slopes[clear], start, inverse_range)

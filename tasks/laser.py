@@ -102,6 +102,8 @@ def detect(image_bgr: NDArray[np.uint8], parameters: LaserParameters) -> LaserPo
     keep = np.bincount(chain, strong)[chain] >= parameters.chain_min_points
     rows, columns = rows[keep], columns[keep]
     u, sigma, prominence = _peaks(stretched, rows, columns)
+    keep = _foremost(rows, u, prominence, 3 * float(np.median(sigma)) if len(sigma) else 0)
+    rows, u, sigma, prominence = (field[keep] for field in (rows, u, sigma, prominence))
     uncertainty = _uncertainty(u, rows, sigma, prominence * _NOISE_GAIN / noise)
     middle = 0.5 * (step - 1)
     uv = np.column_stack([u, rows]).astype(np.float64) * step + middle
@@ -225,6 +227,24 @@ def _green_light(small: NDArray[np.uint8], rows: Indices, columns: Indices, shar
     other = (added[:, 0] + added[:, 2]) * beside[:, 1]
     expected = (beside[:, 0] + beside[:, 2]) * added[:, 1]
     return (other < share * expected) | (added[:, 1] > beside[:, 1])
+
+
+def _foremost(rows: Indices, u: Array, prominence: Array, apart_px: float) -> Indices:
+    """Sorted by row and column, without the lesser of neighbours in a row nearer than apart_px.
+
+    Speckle gives a broad crossing several peaks; the centroids of all of them measure the same line.
+    """
+    order = np.lexsort((u, rows))
+    while len(order) > 1:
+        near = (np.diff(rows[order]) == 0) & (np.diff(u[order]) < apart_px)
+        if not near.any():
+            break
+        left_is_less = prominence[order][:-1] < prominence[order][1:]
+        lesser = np.zeros(len(order), bool)
+        lesser[:-1] |= near & left_is_less
+        lesser[1:] |= near & ~left_is_less
+        order = order[~lesser]
+    return order
 
 
 def _uncertainty(u: Array, rows: Indices, sigma: Array, signal_to_noise: Array) -> Array:

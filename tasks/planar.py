@@ -112,7 +112,7 @@ def _discrepancy(matches: Matches, design: sparse.csr_matrix, unknown: Array) ->
         for k in (0, 1):
             values = -0.5 * off * log_scale_by_ab[column // 4, k]
             by_scale += sparse.csr_matrix((values, (row, column + k)), shape=design.shape)
-    return off, (sparse.diags(share) @ design + by_scale).tocsr()
+    return off, sparse.csr_matrix(design.multiply(share[:, None]) + by_scale)
 
 
 def _design(matches: Matches, count: int) -> sparse.csr_matrix:

@@ -44,9 +44,14 @@ class Departure(NamedTuple):
         return self.origin, self.origin + self.step * (_NODES - 1)
 
 
-@lru_cache(maxsize=4)
 def departure(camera: Camera) -> Departure:
     """The table of a camera; outside of its image the table ends and pixels are NaN."""
+    return _departure(camera.model_dump_json())
+
+
+@lru_cache(maxsize=4)
+def _departure(model: str) -> Departure:
+    camera = Camera.model_validate_json(model)
     border = normalised(camera, outline(camera, 33), 1 / max(_PORT_NEARNESS))
     low, high = border.min(0), border.max(0)
     low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 _REACH_SIGMAS = 4.0
-_BISECTIONS = 30
+_BISECTIONS = 18
 
 
 class View(NamedTuple):

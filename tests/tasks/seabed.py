@@ -9,7 +9,7 @@ from seamosaic.tasks import rotations
 from seamosaic.tasks.mosaic import View
 
 CAMERA = Camera(
-    model="brown", width=400, height=300, fx=520.0, fy=524.0, cx=203.0, cy=146.0,
+    model="brown", width=320, height=240, fx=416.0, fy=420.0, cx=163.0, cy=117.0,
     distortion=(-0.08, 0.03, 0.0006, -0.0005, 0.0),
 )  # fmt: skip
 
@@ -27,23 +27,26 @@ def pose(x, y, z, heading=0.0, roll=0.0, pitch=0.0, mount=(0.0, 0.0, 0.0)):
     return R, np.array([x, y, z])
 
 
-def ground_points(R, C, height: Callable, camera=CAMERA):
-    """First points (H * W, 3) of the ground that the pixels' rays meet, by small steps and then by halving."""
+def ground_points(R, C, height: Callable | float, camera=CAMERA, top=-2.2, bottom=-3.5):
+    """First points (H * W, 3) of the ground that the pixels' rays meet, by small steps down and then by halving."""
     v, u = np.mgrid[: camera.height, : camera.width]
     direction = cameras.rays(camera, np.column_stack([u.ravel(), v.ravel()]).astype(float)).direction @ R.T
-    near, step = np.zeros(len(direction)), 0.02
+    direction /= -np.where(direction[:, 2:] > -1e-3, -1e-3, direction[:, 2:])
+    if not callable(height):
+        return C + direction * (C[2] - height)
+    depth, step = np.full(len(direction), C[2] - top), 0.02
     going = np.ones(len(direction), bool)
-    for _ in range(int(6 / step)):
-        X = C + direction * (near + step)[:, None]
+    for _ in range(int((top - bottom) / step)):
+        X = C + direction * (depth + step)[:, None]
         going &= X[:, 2] > height(X[:, 0], X[:, 1])
-        near[going] += step
-    far = near + step
-    for _ in range(20):
-        middle = (near + far) / 2
+        depth[going] += step
+    low, high = depth + step, depth
+    for _ in range(12):
+        middle = (low + high) / 2
         X = C + direction * middle[:, None]
         above = X[:, 2] > height(X[:, 0], X[:, 1])
-        near, far = np.where(above, middle, near), np.where(above, far, middle)
-    return C + direction * near[:, None]
+        high, low = np.where(above, middle, high), np.where(above, low, middle)
+    return C + direction * high[:, None]
 
 
 def photograph(R, C, height, number, origin=(0.0, 0.0), camera=CAMERA, paint=pattern):

@@ -39,7 +39,7 @@ def test_a_slope_is_recovered_exactly_between_and_on_the_soundings():
     assert ((result.source == 1) == (cells.density > 0)).all()
 
 
-@pytest.mark.parametrize("spacing", [0.5, 0.02])
+@pytest.mark.parametrize("spacing", [0.5, 0.03])
 def test_a_bump_is_recovered_better_from_more_lines(spacing):
     bump = lambda x, y: -10 + 0.3 * np.exp(-((x - WEST - 3) ** 2 + (y - SOUTH - 2.5) ** 2) / 0.5)  # noqa: E731
     result = surface.delaunay_surface(

@@ -129,7 +129,7 @@ def test_bathymetry_has_the_errors_put_in(figures: dict):
     assert abs(bathymetry["altitude_bias_pct"]) < 1.5
 
 
-@pytest.mark.parametrize("level", ["", "reef-3", "reef-3/v2"])
+@pytest.mark.parametrize("level", ["reef-3", "reef-3/v2"])
 def test_takes_any_level_of_the_products(out: Path, mission: Path, level: str):
     assert evaluate(out / level, mission / "truth")["products"] == str(out / "reef-3" / "v2")
 

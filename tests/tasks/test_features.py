@@ -1,0 +1,73 @@
+import cv2
+import numpy as np
+from seamosaic.schemas.parameters import FeatureParameters
+from seamosaic.tasks import features
+
+P = FeatureParameters()
+
+
+def _seabed(height=480, width=640, seed=0):
+    rng = np.random.default_rng(seed)
+    image = np.full((height, width), 120, np.uint8)
+    for _ in range(900):
+        u, v, r, grey = rng.integers(0, width), rng.integers(0, height), rng.integers(2, 9), rng.integers(40, 220)
+        cv2.circle(image, (int(u), int(v)), int(r), int(grey), -1, cv2.LINE_AA)
+    return cv2.GaussianBlur(image, (0, 0), 1)
+
+
+def _none(image):
+    return np.zeros(image.shape, bool)
+
+
+def test_features_follow_a_shift_to_a_fraction_of_a_pixel():
+    image = _seabed()
+    moved = cv2.warpAffine(image, np.array([[1, 0, 7.4], [0, 1, -3.2]]), image.shape[::-1])
+    a, b = (features.detect(each, _none(each), P) for each in (image, moved))
+    pairs = features.match(a.descriptors, b.descriptors, 0.8)
+    shift = b.uv[pairs[:, 1]] - a.uv[pairs[:, 0]]
+    good = np.linalg.norm(shift - [7.4, -3.2], axis=1) < 1
+    assert len(pairs) > 200
+    assert good.mean() > 0.97
+    assert 0.001 < np.abs(shift[good] - [7.4, -3.2]).mean() < 0.2
+
+
+def test_no_feature_on_what_is_to_be_ignored():
+    image = _seabed()
+    ignore = _none(image)
+    ignore[:, 200:400] = True
+    found = features.detect(image, ignore, P)
+    assert len(found.uv) > 100
+    assert not ((found.uv[:, 0] > 201) & (found.uv[:, 0] < 398)).any()
+
+
+def test_large_images_are_halved_and_features_stay_at_full_resolution():
+    image = _seabed(240, 320)
+    large = cv2.resize(image, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+    small_p = FeatureParameters(max_pixels=100_000)
+    found = features.detect(large, _none(large), small_p)
+    reference = features.detect(image, _none(image), small_p)
+    full = (reference.uv + 0.5) * 4 - 0.5
+    nearest = np.linalg.norm(full[:, None] - found.uv[None], axis=2).min(1)
+    assert np.median(nearest) < 1.0
+    assert found.uv.max() > 1000
+
+
+def test_the_strongest_are_kept_everywhere():
+    image = _seabed()
+    image[:, :320] = (image[:, :320].astype(int) - 120) // 6 + 120  # the left half has little contrast
+    found = features.detect(image, _none(image), FeatureParameters(max_features=200))
+    assert len(found.uv) == 200
+    assert (found.uv[:, 0] < 320).sum() > 60
+
+
+def test_an_image_without_texture_has_no_features():
+    grey = np.full((300, 400), 90, np.uint8)
+    found = features.detect(grey, _none(grey), P)
+    assert found.descriptors.shape == (0, 128)
+    assert features.match(found.descriptors, found.descriptors, 0.8).shape == (0, 2)
+
+
+def test_the_ratio_decides_how_many_matches_there_are():
+    a, b = (features.detect(each, _none(each), P) for each in (_seabed(seed=1), _seabed(seed=2)))
+    strict, lax = (len(features.match(a.descriptors, b.descriptors, ratio)) for ratio in (0.7, 0.95))
+    assert 3 * strict < lax

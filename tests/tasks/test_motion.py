@@ -1,0 +1,118 @@
+import numpy as np
+import pytest
+from seamosaic.schemas.parameters import MatchParameters
+from seamosaic.tasks import motion, rotations
+from seamosaic.tasks.navigation import RelativePrior
+
+from tests.tasks import scenes
+
+P = MatchParameters()
+
+
+def _estimate(relief_m, seed, step=(0.25, 0.9, 0.05), **options):
+    rng = np.random.default_rng(seed)
+    points = scenes.seabed(relief_m)
+    poses = scenes.cameras([[0, 0, 0], step], seed=seed)
+    x_i, x_j = scenes.matches(points, poses, 0, 1, rng, **options)
+    lasers = [scenes.laser(points, poses, k, rng) for k in (0, 1)]
+    return motion.estimate(x_i, x_j, *lasers, scenes.FOCAL_PX, P), *scenes.true_motion(poses, 0, 1)
+
+
+@pytest.mark.parametrize(("relief_m", "model"), [(0.0, "homography"), (0.25, "essential")])
+def test_the_motion_is_metric_and_its_covariance_honest(relief_m, model):
+    """Error bounded from both sides: noise of 0.4 px cannot be beaten by a thousand, nor may it be blown up."""
+    errors, scores = [], []
+    for seed in range(12):
+        found, R, t = _estimate(relief_m, seed)
+        assert found is not None
+        assert found.model == model
+        assert found.metric
+        off = np.concatenate([motion.Rotation.from_matrix(R.T @ found.R_i_j).as_rotvec(), R.T @ (found.t_i_j - t)])
+        errors.append(np.linalg.norm(found.t_i_j - t))
+        scores.append(off @ np.linalg.solve(found.covariance, off) / 6)
+    assert 2e-4 < np.median(errors) < 8e-3
+    assert 0.1 < np.median(scores) < 4
+
+
+def test_the_laser_decides_between_homography_and_essential_matrix():
+    rng = np.random.default_rng(0)
+    for relief_m, planar in ((0.0, True), (0.004, True), (0.15, False)):
+        points, poses = scenes.seabed(relief_m), scenes.cameras([[0, 0, 0], [0, 0.9, 0]])
+        lasers = [scenes.laser(points, poses, k, rng) for k in (0, 1)]
+        assert (motion.common_plane(*lasers, P) is not None) == planar
+
+
+def test_without_laser_the_direction_is_right_and_the_length_open():
+    rng = np.random.default_rng(3)
+    points, poses = scenes.seabed(0.3), scenes.cameras([[0, 0, 0], [0.2, 0.9, 0]])
+    x_i, x_j = scenes.matches(points, poses, 0, 1, rng)
+    none = np.zeros((0, 3))
+    found = motion.estimate(x_i, x_j, none, none, scenes.FOCAL_PX, P)
+    R, t = scenes.true_motion(poses, 0, 1)
+    assert found is not None
+    assert not found.metric
+    assert abs(np.linalg.norm(found.t_i_j) - 1) < 1e-3
+    assert np.degrees(np.arccos(found.t_i_j @ t / np.linalg.norm(t))) < 1.0
+    assert rotations.angle_between_deg(R, found.R_i_j) < 0.5
+
+
+def test_on_a_narrow_strip_navigation_leads_to_the_right_motion():
+    rng = np.random.default_rng(5)
+    points, poses = scenes.seabed(0.1), scenes.cameras([[0, 0, 0], [2.1, 0.1, 0]])
+    x_i, x_j = scenes.matches(points, poses, 0, 1, rng, outliers=0.2)
+    R, t = scenes.true_motion(poses, 0, 1)
+    lasers = [scenes.laser(points, poses, k, rng) for k in (0, 1)]
+    covariance = np.diag(np.radians([0.4, 0.4, 1.2]).tolist() + [0.05] * 3) ** 2
+    prior = RelativePrior(R, t + 0.03, covariance)
+    found = motion.estimate(x_i, x_j, *lasers, scenes.FOCAL_PX, P, prior)
+    assert found is not None
+    direction, expected = (v / np.linalg.norm(v) for v in (found.t_i_j, t))
+    assert np.degrees(np.arccos(direction @ expected)) < 2.0
+    assert rotations.angle_between_deg(R, found.R_i_j) < 2.0
+
+
+def test_unrelated_images_have_no_motion():
+    rng = np.random.default_rng(0)
+    x_i, x_j = rng.uniform(-0.3, 0.3, (2, 60, 2))
+    none = np.zeros((0, 3))
+    found = motion.estimate(x_i, x_j, none, none, scenes.FOCAL_PX, P)
+    assert found is None or len(found.inliers) < 25
+    assert motion.estimate(x_i[:5], x_j[:5], none, none, scenes.FOCAL_PX, P) is None
+
+
+def test_plane_through_soundings_with_outliers():
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(-1, 1, (500, 2))
+    X = np.column_stack([xy, 3 + 0.1 * xy[:, 0] - 0.2 * xy[:, 1] + rng.normal(0, 0.003, 500)])
+    X[:40, 2] += rng.uniform(0.1, 0.6, 40)
+    plane = motion.fit_plane(X, 0.02)
+    assert plane is not None
+    normal = np.array([-0.1, 0.2, 1]) / np.sqrt(1.05)
+    assert np.degrees(np.arccos(plane.normal @ normal)) < 0.1
+    assert 0.90 < plane.share < 0.94
+    assert 0.002 < plane.rms_m < 0.005
+    assert motion.fit_plane(X[:5], 0.02) is None
+
+
+def test_scale_is_a_robust_vote_of_the_features_near_soundings():
+    rng = np.random.default_rng(1)
+    soundings = np.column_stack([rng.uniform(-0.9, 0.9, (400, 1)), np.zeros((400, 1)), np.full((400, 1), 3.0)])
+    x = np.column_stack([rng.uniform(-0.3, 0.3, 200), rng.uniform(-0.02, 0.02, 200)])
+    depth = 3.0 / 1.25 * (1 + rng.normal(0, 0.01, 200))
+    depth[:30] *= rng.uniform(0.5, 2, 30)
+    scale, sigma = motion.laser_scale([(x, depth, soundings)])
+    assert abs(scale / 1.25 - 1) < 4 * sigma
+    assert 5e-4 < sigma < 5e-3
+    assert np.isnan(motion.laser_scale([(x + 0.5, depth, soundings)])[0])
+
+
+def test_sampson_and_depths_of_perfect_matches():
+    points, poses = scenes.seabed(0.3), scenes.cameras([[0, 0, 0], [0.3, 0.8, 0.1]])
+    x_i, x_j = scenes.matches(points, poses, 0, 1, np.random.default_rng(0), noise_px=0, outliers=0)
+    R, t = scenes.true_motion(poses, 0, 1)
+    assert np.abs(motion.sampson(x_i, x_j, R, t)).max() < 1e-12
+    assert np.abs(motion.sampson(x_i, np.add(x_j, [0, 1e-3]), R, t)).mean() > 1e-4
+    depth_i, depth_j = motion.depths(x_i, x_j, R, t)
+    X_i = np.column_stack([x_i, np.ones(len(x_i))]) * depth_i[:, None]
+    X_j = np.column_stack([x_j, np.ones(len(x_j))]) * depth_j[:, None]
+    np.testing.assert_allclose(X_i, X_j @ R.T + t, atol=1e-9)
