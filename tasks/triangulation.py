@@ -163,4 +163,5 @@ def sound(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters
         return nothing._replace(cross=found, reason=reason)
     line = cross.whole_line(points, found, image_bgr.shape[:2])
     reach = _REACH_SIGMAS * float(np.median(points.width_px))
+    line = np.concatenate([line, laser.glow(image_bgr, line, reach, points.step_px)])
     return ImageSoundings(soundings.take(keep), points, found, line, reach, "")

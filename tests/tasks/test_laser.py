@@ -183,3 +183,17 @@ def test_mask_covers_the_light_and_little_else():
     assert 0.02 < erased.mean() < 0.06
     assert not laser.mask((50, 60), np.zeros((0, 2)), 3.0).any()
     assert not laser.mask((50, 60), np.array([[1e6, -1e6], [-400.0, 20.0]]), 3.0).any()
+
+
+def test_glow_is_the_green_light_that_no_row_has_a_peak_of_and_that_touches_the_line():
+    image, truth = line_image(noise=1.0, background=80.0)
+    bar, apart = np.s_[300:306, 380:440], np.s_[100:106, 400:440]
+    for place in (bar, apart):
+        image[place] += np.array([8, 45, 6], np.uint8)
+    line = np.column_stack([truth, np.arange(len(truth))])
+    found = laser.glow(image, line, 9.0, 1)
+    erased = laser.mask(image.shape[:2], np.concatenate([line, found]), 9.0)
+    assert erased[bar].all()
+    assert not erased[apart].any()
+    assert len(laser.glow(np.ascontiguousarray(image[..., 1]), line, 9.0, 1)) == 0
+    assert len(laser.glow(image, np.zeros((0, 2)), 9.0, 1)) == 0

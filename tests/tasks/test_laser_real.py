@@ -8,3 +8,50 @@ import pytest
 SHARED = os.environ.get("SEAMOSAIC_SHARED")
 pytestmark = pytest.mark.skipif(SHARED is None, reason="SEAMOSAIC_SHARED names no folder of real recordings")
 DATA = Path(SHARED or ".") / "data"
+
+
+def images(folder: str) -> list[Path]:
+    return sorted((DATA / folder).glob("*.png"))
+
+
+def share_found(points: laser.LaserPoints, expected_uv: np.ndarray, within_px: float) -> float:
+    """Share of expected points with a detection in the same row (or the row averaged with it) at most so far away."""
+    u, v = points.uv.T
+    near = [
+        bool(np.any((np.abs(v - y) <= points.step_px) & (np.abs(u - x) <= within_px))) for x, y in expected_uv.tolist()
+    ]
+    return float(np.mean(near))
+
+
+@pytest.mark.parametrize("number", range(10))
+def test_etna_line(number: int):
+    """One bright line from top to bottom. Judged against the middle of the widest clipped run of each row.
+
+    That criterion (the longest run of values of 250 and more) has nothing in common with the detection; rows whose run
+    is far from the straight line through all of them (glare on metal) are left out. At least 95 % of the rows must
+    have a point within 3 px.
+    """
+    path = images("etna")[number]
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert grey is not None
+    expected = widest_runs(grey >= 250)
+    fit = np.polynomial.Polynomial.fit(expected[:, 1], expected[:, 0], 1)
+    for _ in range(10):
+        off = np.abs(expected[:, 0] - fit(expected[:, 1]))
+        fit = np.polynomial.Polynomial.fit(*expected[off <= max(6.0, float(np.median(off)))].T[::-1], 1)
+    expected = expected[np.abs(expected[:, 0] - fit(expected[:, 1])) < 8]
+    assert len(expected) > 200
+    points = laser.detect(np.asarray(grey, np.uint8), LaserParameters())
+    assert share_found(points, expected, 3.0) > 0.95
+
+
+def widest_runs(lit: np.ndarray) -> np.ndarray:
+    """Middle (N, 2) u, v of the longest run of each row that has one of 5 px or more."""
+    middle = []
+    for v, row in enumerate(lit):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(np.int8), [0]])))
+        start, end = edges[0::2], edges[1::2]
+        if len(start) and (end - start).max() >= 5:
+            k = int(np.argmax(end - start))
+            middle.append([(start[k] + end[k] - 1) / 2, v])
+    return np.array(middle, float).reshape(-1, 2)
