@@ -37,7 +37,9 @@ def detect(grey: NDArray[np.uint8], ignore: NDArray[np.bool_], parameters: Featu
         grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
         halvings += 1
     mask = cv2.resize((~ignore).astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    sift = cv2.SIFT_create(contrastThreshold=parameters.contrast_threshold)
+    # descriptors cost most: half as many again as are kept, to choose from
+    most = parameters.max_features * 3 // 2
+    sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=parameters.contrast_threshold)
     keypoints, descriptors = sift.detectAndCompute(grey, mask)
     if not keypoints:
         return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 128), np.uint8))

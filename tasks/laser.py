@@ -82,7 +82,7 @@ def detect(image_bgr: NDArray[np.uint8], parameters: LaserParameters) -> LaserPo
     """
     if min(image_bgr.shape[:2]) < _SMALLEST_PX:
         return no_points()
-    step = reduction(_green(image_bgr))
+    step = reduction(image_bgr)
     height, width = (side // step for side in image_bgr.shape[:2])
     size = (width, height)
     whole = image_bgr[: height * step, : width * step]
@@ -103,7 +103,7 @@ def detect(image_bgr: NDArray[np.uint8], parameters: LaserParameters) -> LaserPo
     rows, columns = rows[keep], columns[keep]
     u, sigma, prominence = _peaks(stretched, rows, columns)
     keep = _foremost(rows, u, prominence, 3 * float(np.median(sigma)) if len(sigma) else 0)
-    rows, u, sigma, prominence = (field[keep] for field in (rows, u, sigma, prominence))
+    rows, (u, sigma, prominence) = rows[keep], (field[keep] for field in (u, sigma, prominence))
     uncertainty = _uncertainty(u, rows, sigma, prominence * _NOISE_GAIN / noise)
     middle = 0.5 * (step - 1)
     uv = np.column_stack([u, rows]).astype(np.float64) * step + middle
@@ -114,19 +114,23 @@ def _green(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return image if image.ndim == 2 else np.asarray(cv2.extractChannel(image, 1), np.uint8)
 
 
-def reduction(green: NDArray[np.uint8]) -> int:
-    """By how much to reduce an image (H, W) so that its line is as narrow as the kernel: a whole number.
+def reduction(image_bgr: NDArray[np.uint8]) -> int:
+    """By how much to reduce an image (H, W[, 3]) so that its line is as narrow as the kernel: a whole number.
 
     The kernel applied twice answers best to a line of 1.5 px (1 sigma) and with 0.6 of that to one of 3.5 px. In
     some rows, spread over the image, the strongest complete sequence (both positive peaks and the negative one
-    between them) is measured at each reduction; the finest that has 0.6 of the best is taken.
+    between them) is measured at each reduction; the finest that has 0.6 of the best is taken. In colour images it
+    is measured on what green has beyond the other two, so that grey texture does not count.
     """
-    every = max(1, green.shape[0] // 96)
-    rows = green[every // 2 :: every]
+    rows = image_bgr[max(1, image_bgr.shape[0] // 96) // 2 :: max(1, image_bgr.shape[0] // 96)]
+    if rows.ndim == 3:
+        channels = rows.astype(np.float32)
+        excess = channels[..., 1] - 0.5 * (channels[..., 0] + channels[..., 2])
+        rows = excess if np.abs(excess).mean() > 1 else channels[..., 1]
     strength = []
     for factor in _REDUCTIONS:
-        width = green.shape[1] // factor
-        if min(width, green.shape[0] // factor) < _SMALLEST_PX:
+        width = image_bgr.shape[1] // factor
+        if min(width, image_bgr.shape[0] // factor) < _SMALLEST_PX:
             break
         reduced = cv2.resize(rows, (width, len(rows)), interpolation=cv2.INTER_AREA).astype(np.float32)
         second = cv2.filter2D(reduced, -1, _TWICE, borderType=cv2.BORDER_REPLICATE)
@@ -213,8 +217,8 @@ def _green_light(small: NDArray[np.uint8], rows: Indices, columns: Indices, shar
     """Which candidates have the laser's colour.
 
     A pale stone adds to blue and red what it adds to green, in proportion to the light that falls on it; the laser
-    adds nearly nothing to them. Clipped pixels are left out. In grey images nothing can be told, and nor can it
-    where the line outshines the background: there is no texture there to take for a line.
+    adds much less to them. Clipped pixels are left out. In grey images and wholly clipped lines nothing can be told, and nor can it where
+    the line outshines all white light, beside it or in the middle of the image: no texture can be taken for that line.
     """
     offset = np.arange(-_WINDOW_PX, _WINDOW_PX + 1)
     profile = small[rows[:, None], columns[:, None] + offset].astype(np.float32)
@@ -226,7 +230,8 @@ def _green_light(small: NDArray[np.uint8], rows: Indices, columns: Indices, shar
     added = (weight * (crest - beside[:, None])).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
     other = (added[:, 0] + added[:, 2]) * beside[:, 1]
     expected = (beside[:, 0] + beside[:, 2]) * added[:, 1]
-    return (other < share * expected) | (added[:, 1] > beside[:, 1])
+    white = np.minimum(beside[:, 1], np.median(small[::3, ::5, 1]))
+    return (other < share * expected) | (added[:, 1] > white) | (weight.sum(axis=(1, 2)) < 3)
 
 
 def _foremost(rows: Indices, u: Array, prominence: Array, apart_px: float) -> Indices:
@@ -325,4 +330,4 @@ def glow(image_bgr: NDArray[np.uint8], line_uv: Array, halfwidth_px: float, step
     drawn = mask((size[1], size[0]), (line_uv + 0.5) / scale - 0.5, halfwidth_px / scale)
     touched = np.unique(patch[drawn])
     rows, columns = np.nonzero(np.isin(patch, touched[touched > 0]) & ~drawn)
-    return (np.column_stack([columns, rows]) + 0.5) * scale - 0.5
+    return (np.column_stack([columns, rows]).astype(np.float64) + 0.5) * scale - 0.5

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 _REACH_SIGMAS = 4.0
-_BISECTIONS = 18
+_TRIALS = 9
 
 
 class View(NamedTuple):
@@ -143,17 +143,21 @@ def _seen(terrain: Terrain, camera: Camera, pose: Cameras, u: Array, v: Array) -
 def _between(
     terrain: Terrain, camera: Camera, pose: Cameras, sheet: LaserPlane, u: Array, v: Array, arm: int
 ) -> tuple[Array, Array, NDArray[np.uint8], Array]:
-    """Where rows v cross a sheet between columns u and u + 1, by bisection; jumps across a step are left out."""
+    """Where rows v cross a sheet between columns u and u + 1, by false position; jumps across a step are left out."""
+
+    def off(at: Array) -> tuple[Array, Array]:
+        X = _seen(terrain, camera, pose, at, v)
+        return X, X @ sheet.normal - sheet.offset
+
     low, high = u.copy(), u + 1
-
-    def off(at: Array) -> Array:
-        return _seen(terrain, camera, pose, at, v) @ sheet.normal - sheet.offset
-
-    begins_below = off(low) < 0
-    for _ in range(_BISECTIONS):
-        middle = (low + high) / 2
-        same = (off(middle) < 0) == begins_below
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    X = _seen(terrain, camera, pose, (low + high) / 2, v)
-    on = abs(X @ sheet.normal - sheet.offset) < 5e-4
-    return v[on], ((low + high) / 2)[on], np.full(int(on.sum()), arm, np.uint8), X[on]
+    off_low, off_high = off(low)[1], off(high)[1]
+    at, X, left = low, np.zeros((len(u), 3)), off_low
+    for _ in range(_TRIALS):
+        at = (low * off_high - high * off_low) / (off_high - off_low)
+        X, left = off(at)
+        below = (left < 0) == (off_low < 0)
+        # the end that stays is given half its weight, or it might stay for ever (Illinois)
+        low, off_low = np.where(below, at, low), np.where(below, left, off_low / 2)
+        high, off_high = np.where(below, high, at), np.where(below, off_high / 2, left)
+    on = abs(left) < 5e-4
+    return v[on], at[on], np.full(int(on.sum()), arm, np.uint8), X[on]

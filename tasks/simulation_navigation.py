@@ -108,9 +108,10 @@ def _exposures(station_time_s: NDArray, survey: SurveyScene) -> tuple[NDArray, t
     if survey.roles != "pairs":
         return station_time_s, (survey.roles,) * len(station_time_s)
     time = np.concatenate([station_time_s, station_time_s + survey.pair_delay_s])
-    roles: list[Role] = ["texture"] * len(station_time_s) + ["laser"] * len(station_time_s)
+    texture: tuple[Role, ...] = ("texture",) * len(station_time_s)
+    laser: tuple[Role, ...] = ("laser",) * len(station_time_s)
     order = np.argsort(time, kind="stable")
-    return time[order], tuple(roles[k] for k in order)
+    return time[order], tuple((texture + laser)[k] for k in order)
 
 
 def trajectory(plan: Plan, time_s: Array) -> States:

@@ -25,9 +25,14 @@ class Truth(NamedTuple):
 def small_mission(
     folder: Path, scene: str = "reef", images: int = 6, width: int = 608, seed: int = 1, **overrides: Any
 ) -> Path:
-    """A mission of a few small images; overrides as in `simulate`."""
-    lines = {"survey": {"lines": 2 if images >= 6 else 1}}
-    return simulate(scene, folder, seed=seed, images=images, width=width, **(lines | overrides))
+    """A mission of a few small images on a seabed no finer than they show; overrides as in `simulate`."""
+    defaults: dict[str, Any] = {
+        "survey": {"lines": 2 if images >= 6 else 1},
+        "texture": {"cell_m": max(0.003, 1.5 / width)},
+        "terrain": {"cell_m": 0.01 if width > 200 else 0.03},
+    }
+    merged = {key: value | overrides.get(key, {}) for key, value in defaults.items()}
+    return simulate(scene, folder, seed=seed, images=images, width=width, **(overrides | merged))
 
 
 def read_truth(mission: Path) -> Truth:

@@ -268,11 +268,12 @@ def _write_mesh(folder: Path, crs_wkt: str, results: Results) -> MeshQuality:
     moved = Bounds(edges.left - west, edges.bottom - north, edges.right - west, edges.top - north)
     origin = np.array([west, north, 0.0])
     made = mesh.surface_mesh(z.filled(np.nan), coarse, np.zeros(3), moved, p.max_triangles)
+    uv = np.column_stack([made.uv[:, 0], 1 - made.uv[:, 1]])  # images begin at the north, meshes at the south
     comments = [f"offset {west:.3f} {north:.3f} 0.000", f"crs {crs_wkt}"]
-    colours = _sampled(texture, made.uv)
+    colours = _sampled(texture, uv)
     meshes.write_ply(folder / "mesh.ply", made.vertices, made.triangles, colours, comments=comments)
     about = {"crs": crs_wkt, "offset": origin.tolist()}
-    meshes.write_glb(folder / "mesh.glb", made.vertices, made.triangles, made.uv, texture, about)
+    meshes.write_glb(folder / "mesh.glb", made.vertices, made.triangles, uv, texture, about)
     return MeshQuality(vertices=len(made.vertices), triangles=len(made.triangles))
 
 

@@ -92,7 +92,8 @@ def test_the_falling_arm_follows_from_the_normals():
     found = segmented(points)
     for arm, sheet in enumerate(LIGHT.sheets):
         own = found.arm == arm
-        slope = np.polyfit(*points.uv[own].T, 1)[0]
+        u, v = points.uv[own].T
+        slope = np.polyfit(u, v, 1)[0]
         assert np.sign(slope) == np.sign(-sheet.normal[0] / sheet.normal[1])
 
 
@@ -149,7 +150,7 @@ def test_a_coarser_step_gives_the_same_arms():
 
 
 def test_whole_line_has_no_gaps_but_the_wide_ones():
-    points, truth = cross_points(BOTTOMS["level"], noise_px=0.0)
+    points, _ = cross_points(BOTTOMS["level"], noise_px=0.0)
     v = points.uv[:, 1]
     narrow, wide = np.abs(v - 200) < 25, np.abs(v - 700) < 120
     kept = points.take(~narrow & ~wide)

@@ -3,7 +3,12 @@
 import os
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+
+from seamosaic.schemas.parameters import LaserParameters
+from seamosaic.tasks import laser
 
 SHARED = os.environ.get("SEAMOSAIC_SHARED")
 pytestmark = pytest.mark.skipif(SHARED is None, reason="SEAMOSAIC_SHARED names no folder of real recordings")
@@ -54,4 +59,43 @@ def widest_runs(lit: np.ndarray) -> np.ndarray:
         if len(start) and (end - start).max() >= 5:
             k = int(np.argmax(end - start))
             middle.append([(start[k] + end[k] - 1) / 2, v])
+    return np.array(middle, float).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("number", range(8))
+def test_lsu_lines(number: int):
+    """Fifteen green lines on a wall (image*) or on a coral and what is behind it (coral*).
+
+    Judged in a region drawn by hand around them (the chessboard and the window of the room are outside): the
+    middle of each run of 2 to 30 px in a row that is greener than red by more than Otsu's threshold of that region.
+    On the wall 80 % of these runs must have a point within 3 px, and 60 % of all points must lie within 3 px of the
+    light; on the coral, which glows and is not only lines, half of the runs.
+    """
+    path = images("lsu")[number]
+    image = cv2.imread(str(path))
+    assert image is not None
+    region = np.s_[300:1130, 820:1500]
+    greener = np.clip(image[..., 1].astype(int) - image[..., 2], 0, 255).astype(np.uint8)
+    threshold, _ = cv2.threshold(np.ascontiguousarray(greener[region]), 0, 255, cv2.THRESH_OTSU)
+    lit = np.zeros(greener.shape, bool)
+    lit[region] = greener[region] > threshold
+    expected = all_runs(lit)
+    points = laser.detect(np.asarray(image, np.uint8), LaserParameters())
+    chosen = np.random.default_rng(0).permutation(len(expected))[:1500]
+    found = share_found(points, expected[chosen], 3.0)
+    near_light = cv2.dilate(lit.astype(np.uint8), np.ones((1, 7), np.uint8))
+    u, v = np.round(points.uv).astype(int).T
+    if path.name.startswith("coral"):
+        assert found > 0.5
+    else:
+        assert found > 0.8
+        assert near_light[v, u].mean() > 0.6
+
+
+def all_runs(lit: np.ndarray) -> np.ndarray:
+    """Middle (N, 2) u, v of every run of 2 to 30 px."""
+    middle = []
+    for v, row in enumerate(lit):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(np.int8), [0]])))
+        middle += [[(a + b - 1) / 2, v] for a, b in zip(edges[0::2], edges[1::2], strict=True) if 2 <= b - a <= 30]
     return np.array(middle, float).reshape(-1, 2)

@@ -30,7 +30,16 @@ BIAS_M, NOISE_M, MOVE_M = 0.05, 0.004, 0.12
 @pytest.fixture(scope="module")
 def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("missions") / "reef"
-    return simulate("reef", folder, seed=3, images=4, width=96, survey={"lines": 2}, texture={"cell_m": 0.02})
+    return simulate(
+        "reef",
+        folder,
+        seed=3,
+        images=4,
+        width=96,
+        survey={"lines": 2},
+        texture={"cell_m": 0.02},
+        terrain={"cell_m": 0.02},
+    )
 
 
 @pytest.fixture(scope="module")

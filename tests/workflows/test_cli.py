@@ -1,0 +1,64 @@
+import json
+
+import pytest
+from seamosaic.workflows import cli
+from typer.testing import CliRunner
+
+RUNNER = CliRunner()
+
+
+def _main(monkeypatch, *arguments):
+    """Exit code of the command as a shell sees it."""
+    monkeypatch.setattr("sys.argv", ["seamosaic", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    return ended.value.code or 0
+
+
+def test_help_names_every_command():
+    text = RUNNER.invoke(cli.app, ["--help"]).output
+    for command in ("run", "check", "simulate", "evaluate", "demo"):
+        assert command in text
+
+
+def test_check_of_a_good_mission(tiny_mission, monkeypatch):
+    assert _main(monkeypatch, "check", tiny_mission) == 0
+
+
+def test_wrong_input_is_exit_code_2_with_every_problem(tiny_mission, monkeypatch, capfd):
+    text = (tiny_mission / "calibration.yaml").read_text().replace("fx: 80.0", "fx: -80.0").replace("cx", "cxx")
+    (tiny_mission / "calibration.yaml").write_text(text)
+    for arguments in (["check", tiny_mission], ["run", tiny_mission, "-o", tiny_mission.parent / "out"]):
+        assert _main(monkeypatch, *arguments) == 2
+        captured = capfd.readouterr()
+        said = captured.out + captured.err
+        assert "fx" in said
+        assert "cxx" in said
+        assert "Traceback" not in said
+
+
+def test_wrong_parameters_are_exit_code_2(tiny_mission, monkeypatch, capfd):
+    out = tiny_mission.parent / "out"
+    assert _main(monkeypatch, "run", tiny_mission, "-o", out, "--set", "grid.cell=1") == 2
+    assert _main(monkeypatch, "run", tiny_mission, "-o", out, "--params", tiny_mission / "none.yaml") == 2
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_nothing_to_map_is_exit_code_1(tiny_mission, monkeypatch, capfd):
+    arguments = ["run", tiny_mission, "-o", tiny_mission.parent / "out", "--scheduler", "sync"]
+    assert _main(monkeypatch, *arguments) == 1
+    assert "nothing to map" in " ".join(capfd.readouterr().err.split())
+
+
+def test_run_and_evaluate_print_figures(reef, monkeypatch, capfd):
+    assert _main(monkeypatch, "run", reef.mission, "-o", reef.out, "--scheduler", "sync") == 0
+    assert "nothing changed" in " ".join(capfd.readouterr().out.split())
+    assert _main(monkeypatch, "evaluate", reef.out, "--truth", reef.mission) == 0
+    assert "trajectory" in json.loads(capfd.readouterr().out)
+
+
+def test_simulate_makes_a_mission(tmp_path, monkeypatch):
+    out = tmp_path / "made"
+    assert _main(monkeypatch, "simulate", "plane", out, "--images", 2, "--width", 320) == 0
+    assert len(list((out / "images").iterdir())) == 2
+    assert _main(monkeypatch, "check", out) == 0

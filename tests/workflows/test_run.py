@@ -1,0 +1,212 @@
+"""The main job end to end on small simulated missions, with the real Dask schedulers."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyogrio
+import pytest
+import rasterio
+import trimesh
+import xarray
+from rio_cogeo import cog_validate
+from seamosaic.catalog import trajectories
+from seamosaic.schemas.parameters import Parameters
+from seamosaic.schemas.problems import InvalidInput
+from seamosaic.schemas.products import PRODUCTS
+from seamosaic.workflows import run as runner
+from seamosaic.workflows.evaluate import evaluate
+from seamosaic.workflows.run import NothingToMap, run
+
+from tests.simulated import small_mission
+
+
+def _computed(result):
+    return {step.name: step.count_computed for step in result.steps}
+
+
+def _data(folder: Path):
+    """Everything in a version but times and file names."""
+    values = []
+    for name in ("bathymetry.tif", "uncertainty.tif", "source.tif", "mosaic.tif", "mosaic-source.tif"):
+        with rasterio.open(folder / name) as file:
+            values.append(file.read())
+    return [*values, (folder / "trajectory.csv").read_bytes()]
+
+
+def _same(a: Path, b: Path) -> bool:
+    return all(
+        np.array_equal(x, y) if isinstance(x, np.ndarray) else x == y for x, y in zip(_data(a), _data(b), strict=True)
+    )
+
+
+def test_every_product_is_there_and_opens_elsewhere(reef):
+    folder = reef.result.path
+    assert folder.name == "v1"
+    for product in PRODUCTS:
+        assert (folder / product.name).stat().st_size > 0, product.name
+    for name in ("bathymetry", "uncertainty", "density", "source", "mosaic", "mosaic-source", "mosaic-planar"):
+        assert cog_validate(folder / f"{name}.tif", quiet=True)[0], name
+    with laspy.open(folder / "soundings.laz") as cloud:
+        assert cloud.header.point_count == reef.result.quality.soundings.count > 1000
+    for name in ("mesh.ply", "mesh.glb"):
+        assert len(trimesh.load(folder / name, force="mesh").faces) > 100
+    assert set(pyogrio.list_layers(folder / "survey.gpkg")[:, 0]) == {"footprints", "track", "contours", "coverage"}
+    with xarray.open_dataset(folder / "bathymetry.nc") as layers:
+        assert "elevation" in layers
+    assert "<html" in (folder / "report.html").read_text()
+
+
+def test_products_agree_with_the_truth(reef):
+    """Both-sided: a map better than its photographs would be a copy of the truth."""
+    measured = evaluate(reef.result.path, reef.mission)
+    trajectory, bathymetry = measured["trajectory"], measured["bathymetry"]
+    assert 1e-5 < trajectory["rigid_rms_m"] < 0.06
+    assert trajectory["absolute_rms_m"] < 3 * 0.4
+    assert abs(bathymetry["abs_bias_m"]) < 3 * 0.0323
+    assert 5e-4 < bathymetry["median_abs_m"] < 0.01
+
+
+def test_the_laser_is_gone_from_the_mosaic(reef):
+    with rasterio.open(reef.result.path / "mosaic.tif") as file:
+        red, green, blue = file.read().astype(int)
+        excess = (green - np.maximum(red, blue))[file.dataset_mask() > 0]
+    assert (excess > 60).mean() < 2e-3
+
+
+def test_mosaic_source_counts_rows_of_the_trajectory(reef):
+    rows = trajectories.read(reef.result.path / "trajectory.csv")
+    with rasterio.open(reef.result.path / "mosaic-source.tif") as file:
+        numbers = set(np.unique(file.read(1)).tolist())
+    assert numbers <= {-1, *range(len(rows))}
+    assert len(numbers) > len(rows) / 2
+
+
+def test_provenance_names_every_input_step_and_output(reef):
+    provenance = json.loads((reef.result.path / "metadata/provenance.json").read_text())
+    inputs = {path.relative_to(reef.mission).as_posix() for path in reef.mission.rglob("*") if path.is_file()}
+    assert set(provenance["inputs"]) == {name for name in inputs if not name.startswith("truth/")}
+    counts = {step["name"]: step["count_total"] for step in provenance["steps"]}
+    assert counts["extract"] == 8
+    assert counts["adjust"] == 1
+    assert provenance["parameters"]["grid"]["cell_m"] >= 0.02
+    assert {"bathymetry.tif", "report.html"} <= set(provenance["outputs"])
+
+
+def test_a_second_run_computes_nothing_and_makes_no_version(reef):
+    again = run(str(reef.mission), reef.out, Parameters(), scheduler="sync")
+    assert sum(_computed(again).values()) == 0
+    assert (again.path, again.new) == (reef.result.path, False)
+
+
+def test_another_cell_size_recomputes_the_maps_only(reef, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(reef.out, out)
+    parameters = Parameters.model_validate({"grid": {"cell_m": 0.05}})
+    result = run(str(reef.mission), out, parameters, scheduler="sync")
+    computed = _computed(result)
+    assert [computed[step] for step in ("extract", "match", "adjust", "lighting")] == [0, 0, 0, 0]
+    assert computed["cells"] > 0
+    assert result.path.name == "v2"
+    with (
+        rasterio.open(result.path / "bathymetry.tif") as new,
+        rasterio.open(out / result.path.parent.name / "v1/bathymetry.tif") as old,
+    ):
+        assert (new.res[0], old.res[0]) == (0.05, reef.result.quality.bathymetry.cell_m)
+        assert abs(round(new.bounds.left / 0.05) * 0.05 - new.bounds.left) < 1e-6
+
+
+def test_processes_give_the_same_data_as_one_thread(reef, tmp_path):
+    result = run(str(reef.mission), tmp_path, Parameters(), workers=2)
+    assert _same(result.path, reef.result.path)
+
+
+def _wait_for(folder: Path, count: int, process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + 120
+    while len(list(folder.rglob("*.npz"))) < count:
+        assert process.poll() is None, "the run ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_a_killed_run_goes_on_where_it_stopped(reef, tmp_path):
+    command = [sys.executable, "-m", "seamosaic.workflows.cli", "run", str(reef.mission), "-o", str(tmp_path)]
+    process = subprocess.Popen([*command, "--scheduler", "sync"], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    steps = tmp_path / reef.result.path.parent.name / "steps"
+    _wait_for(steps / "extract", 3, process)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not list(tmp_path.glob("*/v*"))
+    kept = {path for path in steps.rglob("*.npz")}
+    result = run(str(reef.mission), tmp_path, Parameters(), scheduler="sync")
+    total = {step.name: step.count_total for step in result.steps}
+    assert 3 <= len(kept) == sum(total.values()) - sum(_computed(result).values())
+    assert _same(result.path, reef.result.path)
+
+
+@pytest.fixture
+def spoilt(reef, tmp_path):
+    """The mission with its third image cut in half, to the decoder only: its end marker is there."""
+    mission = tmp_path / "mission"
+    shutil.copytree(reef.mission, mission)
+    image = sorted((mission / "images").iterdir())[2]
+    return mission, image
+
+
+def test_a_bad_image_is_recorded_and_the_run_goes_on(spoilt, tmp_path):
+    mission, image = spoilt
+    image.write_bytes(image.read_bytes()[:2000])
+    result = run(str(mission), tmp_path / "out", Parameters(), scheduler="threads", workers=2)
+    rows = trajectories.read(result.path / "trajectory.csv")
+    assert [row.kind for row in rows].count("rejected") == 1
+    row = next(row for row in rows if row.kind == "rejected")
+    assert row.image.endswith(image.name)
+    assert "truncated" in row.status
+    assert image.name in (result.path / "report.html").read_text()
+
+
+def test_an_image_changed_during_the_run_is_rejected(spoilt, tmp_path, monkeypatch):
+    mission, image = spoilt
+    opened = runner._open
+
+    def replaced(*arguments):
+        found = opened(*arguments)
+        shutil.copy(sorted((mission / "images").iterdir())[4], image)
+        return found
+
+    monkeypatch.setattr(runner, "_open", replaced)
+    result = run(str(mission), tmp_path / "out", Parameters(), scheduler="sync")
+    rows = trajectories.read(result.path / "trajectory.csv")
+    assert [row.status for row in rows if row.kind == "rejected"] == [
+        "rejected: the file changed while the mission was being processed"
+    ]
+
+
+def test_a_mission_of_black_images_says_that_there_is_nothing_to_map(tiny_mission, tmp_path):
+    with pytest.raises(NothingToMap, match="nothing to map"):
+        run(str(tiny_mission), tmp_path / "out", Parameters(), scheduler="sync")
+
+
+def test_no_scheduler_at_the_address(tiny_mission, tmp_path):
+    with pytest.raises(InvalidInput, match="scheduler"):
+        run(str(tiny_mission), tmp_path / "out", Parameters(), scheduler="nowhere:1")
+
+
+@pytest.mark.parametrize("scene", ["pool", "night", "pairs"])
+def test_without_navigation_without_light_and_in_turns(scene, tmp_path):
+    mission = small_mission(tmp_path / "mission", scene, images=8)
+    result = run(str(mission), tmp_path / "out", Parameters(), scheduler="sync")
+    quality = result.quality
+    placed = quality.trajectory.adjusted + quality.trajectory.navigation_only
+    assert placed == quality.mission.images.total
+    assert quality.bathymetry.cells > 500
+    assert quality.soundings.count > 500
+    assert (quality.mission.crs is None) == (scene == "pool")
+    assert (quality.mosaic.area_m2 > 1) == (scene != "night")
