@@ -18,12 +18,13 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from ..schemas.parameters import AdjustParameters
 from .motion import Motion
-from .navigation import NavigationPrior, Poses, relative
+from .navigation import NavigationPrior, Poses, relative, walk_m
 
 Array = NDArray[Any]
 Status = Literal["adjusted", "navigation", "rejected: no link to the first image"]
 
 _DATUM_SIGMA = 1e-5
+_EXACT_M, _EXACT_RAD, _ANYWHERE_M = 1e-3, 1e-4, 1e3
 # what calibration and the pinhole leave in a pair motion, whatever its matches say: 0.01 degree and 1 mm
 _LINK_FLOOR = np.diag([np.radians(0.01)] * 3 + [1e-3] * 3) ** 2
 
@@ -142,23 +143,50 @@ def _datum(start: Poses, first: int) -> Any:
 
 
 def _navigation_factors(navigation: NavigationPrior) -> Any:
+    """What navigation says, in variables of its own: where it would have been but for its drift.
+
+    A navigation variable keeps navigation's attitude and depth; its horizontal position is that of the camera. So
+    steps are held in the local frame, whatever the heading sensor's error, and the shape of the track helps to
+    orient the map. Offset and attitude biases are shared by the whole track: n priors together weigh as much as
+    one measurement of the stated sigma.
+    """
     graph = gtsam.NonlinearFactorGraph()
     poses = navigation.poses
-    known = np.flatnonzero(poses.known)
-    # the whole track shares one offset: n priors together weigh as much as one position of sigma_horizontal
-    horizontal = navigation.sigma_horizontal * np.sqrt(len(known))
+    known = np.flatnonzero(poses.known).tolist()
+    count = len(known)
     for k in known:
-        R = poses.R_local_camera[k]
-        position = R.T @ np.diag([horizontal[k], horizontal[k], navigation.sigma_depth[k]]) ** 2 @ R
-        attitude = np.diag(navigation.sigma_attitude[k] ** 2)
-        rotation = navigation.R_camera_vehicle @ attitude @ navigation.R_camera_vehicle.T
-        noise = _gaussian(np.asarray(block_diag(rotation, position)))
-        graph.add(gtsam.PriorFactorPose3(int(k), _pose(R, poses.C_local[k]), noise))
-    for a, b in itertools.pairwise(known.tolist()):
+        R, own = poses.R_local_camera[k], _pose(poses.R_local_camera[k], poses.C_local[k])
+        offset = navigation.sigma_horizontal[k] * np.sqrt(count)
+        graph.add(gtsam.PriorFactorPose3(_of_navigation(k), own, _noise(_EXACT_RAD, R, offset, _EXACT_M)))
+        attitude = _attitude(navigation, k) * count
+        tie = _noise(attitude, R, _EXACT_M, float(navigation.sigma_depth[k]))
+        graph.add(gtsam.BetweenFactorPose3(_of_navigation(k), k, gtsam.Pose3(), tie))
+    for a, b in itertools.pairwise(known):
         step = relative(navigation, a, b)
-        noise = _gaussian(step.covariance)
-        graph.add(gtsam.BetweenFactorPose3(a, b, _pose(step.R_i_j, step.t_i_j), noise))
+        between, R = _pose(step.R_i_j, step.t_i_j), poses.R_local_camera[b]
+        walk = _noise(_EXACT_RAD, R, walk_m(navigation, a, b) + _EXACT_M, _EXACT_M)
+        graph.add(gtsam.BetweenFactorPose3(_of_navigation(a), _of_navigation(b), between, walk))
+        turn = _noise(step.covariance[:3, :3], R, _ANYWHERE_M, _ANYWHERE_M)
+        graph.add(gtsam.BetweenFactorPose3(a, b, between, turn))
     return graph
+
+
+def _of_navigation(k: int) -> int:
+    return gtsam.symbol("n", k)
+
+
+def _attitude(navigation: NavigationPrior, k: int) -> Array:
+    """Covariance (3, 3) of navigation's attitude about the camera's axes."""
+    R = navigation.R_camera_vehicle
+    return R @ np.diag(navigation.sigma_attitude[k] ** 2) @ R.T
+
+
+def _noise(rotation: Array | float, R_local_camera: Array, horizontal_m: float, vertical_m: float) -> Any:
+    """Noise of a pose: covariance (3, 3) or sigma of its rotation, sigmas of its position along the local axes."""
+    R = R_local_camera
+    position = R.T @ np.diag([horizontal_m, horizontal_m, vertical_m]) ** 2 @ R
+    turn = rotation if isinstance(rotation, np.ndarray) else np.eye(3) * rotation**2
+    return _gaussian(np.asarray(block_diag(turn, position)))
 
 
 def _gaussian(covariance: Array) -> Any:
@@ -204,9 +232,12 @@ def _total(graph: Any, links: list[Link], kernel: Any) -> Any:
 
 
 def _solve(graph: Any, links: list[Link], start: Poses, kernel: Any) -> Any:
-    values = gtsam.Values()
-    for k in np.flatnonzero(start.known):
-        values.insert(int(k), _pose(start.R_local_camera[k], start.C_local[k]))
+    values, keys = gtsam.Values(), graph.keys()
+    for k in np.flatnonzero(start.known).tolist():
+        pose = _pose(start.R_local_camera[k], start.C_local[k])
+        values.insert(k, pose)
+        if keys.count(_of_navigation(k)):
+            values.insert(_of_navigation(k), pose)
     total = _total(graph, links, kernel)
     return gtsam.LevenbergMarquardtOptimizer(total, values, gtsam.LevenbergMarquardtParams()).optimize()
 

@@ -117,16 +117,13 @@ def _green(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def reduction(image_bgr: NDArray[np.uint8]) -> int:
     """By how much to reduce an image (H, W[, 3]) so that its line is as narrow as the kernel: a whole number.
 
-    The kernel applied twice answers best to a line of 1.5 px (1 sigma) and with 0.6 of that to one of 3.5 px. In
+    The kernel applied twice answers best to a line of 1.5 px (1 sigma) and with half of that to one of 4 px. In
     some rows, spread over the image, the strongest complete sequence (both positive peaks and the negative one
-    between them) is measured at each reduction; the finest that has 0.6 of the best is taken. In colour images it
+    between them) is measured at each reduction; the finest that has half of the best is taken. In colour images it
     is measured on what green has beyond the other two, so that grey texture does not count.
     """
-    rows = image_bgr[max(1, image_bgr.shape[0] // 96) // 2 :: max(1, image_bgr.shape[0] // 96)]
-    if rows.ndim == 3:
-        channels = rows.astype(np.float32)
-        excess = channels[..., 1] - 0.5 * (channels[..., 0] + channels[..., 2])
-        rows = excess if np.abs(excess).mean() > 1 else channels[..., 1]
+    every = max(1, image_bgr.shape[0] // 96)
+    rows = _greener(image_bgr[every // 2 :: every])
     strength = []
     for factor in _REDUCTIONS:
         width = image_bgr.shape[1] // factor
@@ -138,8 +135,22 @@ def reduction(image_bgr: NDArray[np.uint8]) -> int:
         middle = slice(_LOBE_OFFSET, width - _LOBE_OFFSET)
         beside = np.minimum(lobes[:, : -2 * _LOBE_OFFSET], lobes[:, 2 * _LOBE_OFFSET :])
         strength.append(float(np.median(np.minimum(-second[:, middle], 2 * beside).max(axis=1))))
-    enough = [factor for factor, s in zip(_REDUCTIONS, strength, strict=False) if s >= 0.6 * max(strength)]
+    enough = [factor for factor, s in zip(_REDUCTIONS, strength, strict=False) if s >= 0.5 * max(strength)]
     return enough[0]
+
+
+def _greener(image_bgr: NDArray[np.uint8]) -> Floats:
+    """What green (H, W) has beyond blue and red; the grey level itself where there is no colour."""
+    if image_bgr.ndim == 2:
+        return image_bgr.astype(np.float32)
+    blue, green, red = (image_bgr[..., k].astype(np.float32) for k in range(3))
+    excess = green - 0.5 * (blue + red)
+    if np.abs(excess).mean() <= 1:
+        return green
+    # the core of an overexposed line is white between green edges
+    width = image_bgr.shape[1] // 40 | 1
+    closed = cv2.morphologyEx(excess, cv2.MORPH_CLOSE, np.ones((1, width), np.uint8))
+    return np.where(green >= 250, closed, excess).astype(np.float32)
 
 
 def _noise(second: Floats, stretch: float) -> float:
@@ -217,8 +228,8 @@ def _green_light(small: NDArray[np.uint8], rows: Indices, columns: Indices, shar
     """Which candidates have the laser's colour.
 
     A pale stone adds to blue and red what it adds to green, in proportion to the light that falls on it; the laser
-    adds much less to them. Clipped pixels are left out. In grey images and wholly clipped lines nothing can be told, and nor can it where
-    the line outshines all white light, beside it or in the middle of the image: no texture can be taken for that line.
+    adds much less to them. Clipped pixels are left out. Nothing can be told in grey images, on wholly clipped lines,
+    and where the line outshines all white light, beside it or in the middle of the image: no texture does that.
     """
     offset = np.arange(-_WINDOW_PX, _WINDOW_PX + 1)
     profile = small[rows[:, None], columns[:, None] + offset].astype(np.float32)
@@ -315,7 +326,7 @@ def mask(shape: tuple[int, int], uv: Array, halfwidth_px: float) -> NDArray[np.b
 def glow(image_bgr: NDArray[np.uint8], line_uv: Array, halfwidth_px: float, step_px: int) -> Array:
     """Pixels (M, 2) of laser light that mask() would leave: faint or running along the rows, where no row has a peak.
 
-    Patches greener, by a fifth, than what is around them, that hang together with the line found (line_uv).
+    Patches greener, by 15 %, than what is around them, that hang together with the line found (line_uv).
     """
     if image_bgr.ndim == 2 or not len(line_uv):
         return np.zeros((0, 2))
@@ -326,7 +337,7 @@ def glow(image_bgr: NDArray[np.uint8], line_uv: Array, halfwidth_px: float, step
     blue, green, red = (small[..., k].astype(np.float32) + 8 for k in range(3))
     ratio = np.clip(128 * green / (blue + red), 0, 255)
     around = cv2.medianBlur(ratio.astype(np.uint8), min(size) // 5 | 1)
-    patch = cv2.connectedComponents((ratio > 1.2 * around).astype(np.uint8), connectivity=8)[1]
+    patch = cv2.connectedComponents((ratio > 1.15 * around).astype(np.uint8), connectivity=8)[1]
     drawn = mask((size[1], size[0]), (line_uv + 0.5) / scale - 0.5, halfwidth_px / scale)
     touched = np.unique(patch[drawn])
     rows, columns = np.nonzero(np.isin(patch, touched[touched > 0]) & ~drawn)

@@ -98,14 +98,18 @@ def relative(navigation: NavigationPrior, i: int, j: int) -> RelativePrior:
     poses = navigation.poses
     R_i, R_j = poses.R_local_camera[i], poses.R_local_camera[j]
     step = poses.C_local[j] - poses.C_local[i]
-    elapsed = abs(float(navigation.time_s[j] - navigation.time_s[i]))
     attitude = (navigation.sigma_attitude[i] ** 2 + navigation.sigma_attitude[j] ** 2) / 2
-    stated = np.hypot(navigation.sigma_horizontal[i], navigation.sigma_horizontal[j])
-    walk = min(navigation.drift_m_per_sqrt_s * np.sqrt(elapsed), stated)
     turned = np.sqrt(attitude.max()) * float(np.linalg.norm(step))
-    horizontal = walk**2 + turned**2 + 1e-6
+    horizontal = walk_m(navigation, i, j) ** 2 + turned**2 + 1e-6
     vertical = navigation.sigma_depth[i] ** 2 + navigation.sigma_depth[j] ** 2
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = navigation.R_camera_vehicle @ np.diag(2 * attitude) @ navigation.R_camera_vehicle.T
     covariance[3:, 3:] = R_j.T @ np.diag([horizontal, horizontal, vertical]) @ R_j
     return RelativePrior(R_i.T @ R_j, R_i.T @ step, covariance)
+
+
+def walk_m(navigation: NavigationPrior, i: int, j: int) -> float:
+    """1-sigma along either horizontal axis of navigation's step between two images, metres."""
+    elapsed = abs(float(navigation.time_s[j] - navigation.time_s[i]))
+    stated = np.hypot(navigation.sigma_horizontal[i], navigation.sigma_horizontal[j])
+    return float(min(navigation.drift_m_per_sqrt_s * np.sqrt(elapsed), stated))

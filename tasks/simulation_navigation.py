@@ -106,12 +106,12 @@ def plan(
 
 def _exposures(station_time_s: NDArray, survey: SurveyScene) -> tuple[NDArray, tuple[Role, ...]]:
     if survey.roles != "pairs":
-        return station_time_s, (survey.roles,) * len(station_time_s)
+        role: Role = survey.roles
+        return station_time_s, tuple(role for _ in station_time_s)
     time = np.concatenate([station_time_s, station_time_s + survey.pair_delay_s])
-    texture: tuple[Role, ...] = ("texture",) * len(station_time_s)
-    laser: tuple[Role, ...] = ("laser",) * len(station_time_s)
+    both: tuple[Role, Role] = ("texture", "laser")
     order = np.argsort(time, kind="stable")
-    return time[order], tuple((texture + laser)[k] for k in order)
+    return time[order], tuple(both[int(k) // len(station_time_s)] for k in order)
 
 
 def trajectory(plan: Plan, time_s: Array) -> States:

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from ..schemas.calibration import Camera
 from .camera import rays
@@ -13,6 +14,8 @@ Array = NDArray[Any]
 
 _MATCH_SIGMA_PX = 0.5
 _MAX_GAP_PX = 4.0
+_NEIGHBOURS = 8
+_STEEPEST = 1.5  # rise over run between a point and its neighbours
 _MIN_PARALLAX = 0.02  # radians; below it depth is little more than a guess
 
 
@@ -51,11 +54,26 @@ def triangulate(
     distance, parallax = range_i[keep], parallax[keep]
     angle_sigma = _MATCH_SIGMA_PX * np.sqrt(2) / camera.fx
     turn, shift = (np.sqrt(np.trace(motion_covariance[s, s]) / 3) for s in (slice(0, 3), slice(3, 6)))
-    return TiePoints(
+    found = TiePoints(
         X_local=(P_i[keep] + P_j[keep]) / 2,
         sigma_m=distance * angle_sigma / parallax,
         common_sigma_m=np.hypot(distance * turn, shift) / parallax,
     )
+    return TiePoints(*(values[_like_neighbours(found)] for values in found))
+
+
+def _like_neighbours(points: TiePoints) -> NDArray[np.bool_]:
+    """Which points (N,) lie on the surface of their neighbours.
+
+    A wrong match along the epipolar line passes every test of the two rays, but its point stands alone, decimetres
+    above or below the seabed; terrain as steep as a boulder's side is let pass.
+    """
+    X = points.X_local
+    if len(X) <= _NEIGHBOURS:
+        return np.zeros(len(X), bool)
+    distance, nearest = (np.asarray(found) for found in KDTree(X[:, :2]).query(X[:, :2], k=_NEIGHBOURS + 1))
+    off = np.abs(X[:, 2] - np.median(X[nearest[:, 1:], 2], axis=1))
+    return np.asarray(off < 5 * points.sigma_m + _STEEPEST * np.median(np.asarray(distance)[:, 1:], axis=1))
 
 
 def _local_rays(camera: Camera, uv: Array, poses: Poses, k: int) -> tuple[Array, Array]:

@@ -187,7 +187,7 @@ def test_mask_covers_the_light_and_little_else():
 
 def test_glow_is_the_green_light_that_no_row_has_a_peak_of_and_that_touches_the_line():
     image, truth = line_image(noise=1.0, background=80.0)
-    bar, apart = np.s_[300:306, 380:440], np.s_[100:106, 400:440]
+    bar, apart = np.s_[300:306, 368:440], np.s_[100:106, 400:440]
     for place in (bar, apart):
         image[place] += np.array([8, 45, 6], np.uint8)
     line = np.column_stack([truth, np.arange(len(truth))])

@@ -6,7 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
 from seamosaic.schemas.parameters import LaserParameters
 from seamosaic.tasks import laser
 
@@ -43,7 +42,8 @@ def test_etna_line(number: int):
     fit = np.polynomial.Polynomial.fit(expected[:, 1], expected[:, 0], 1)
     for _ in range(10):
         off = np.abs(expected[:, 0] - fit(expected[:, 1]))
-        fit = np.polynomial.Polynomial.fit(*expected[off <= max(6.0, float(np.median(off)))].T[::-1], 1)
+        u, v = expected[off <= max(6.0, float(np.median(off)))].T
+        fit = np.polynomial.Polynomial.fit(v, u, 1)
     expected = expected[np.abs(expected[:, 0] - fit(expected[:, 1])) < 8]
     assert len(expected) > 200
     points = laser.detect(np.asarray(grey, np.uint8), LaserParameters())
