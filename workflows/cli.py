@@ -187,7 +187,7 @@ def main() -> None:
     except InvalidInput as error:
         from .check import print_problems
 
-        print_problems(error.problems, "", _errors)
+        print_problems(error.problems, "invalid input", _errors)
         sys.exit(INVALID)
     except KeyboardInterrupt:
         _errors.print("Stopped. Run the same command again to go on from here.")

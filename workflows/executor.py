@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
+import dask.config
 from dask.base import compute
 from dask.callbacks import Callback
 from dask.delayed import Delayed
@@ -13,6 +14,9 @@ from distributed import Client, Future, LocalCluster, as_completed
 from ..schemas.problems import InvalidInput, Problem
 
 Progress = Callable[[int], None]
+
+# a busy machine answers late; that is no reason to give up a run
+_PATIENCE = {"distributed.comm.timeouts.connect": "120s", "distributed.comm.timeouts.tcp": "300s"}
 
 
 class Executor(Protocol):
@@ -67,10 +71,11 @@ def open_executor(scheduler: str | None, workers: int | None) -> Iterator[Execut
     workers : processes or threads; None for one a core. Without meaning for a scheduler elsewhere.
     """
     count = workers or os.cpu_count() or 1
+    dask.config.set(_PATIENCE)
     if scheduler in ("sync", "threads"):
         yield LocalExecutor(scheduler, count)
     elif scheduler is None:
-        options: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": None}
+        options: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": ":0"}
         with LocalCluster(**options) as cluster, Client(cluster) as client:
             yield ClusterExecutor(client)
     else:

@@ -17,6 +17,7 @@ from .match import PairTask
 # Height above the seabed that is assumed where neither altimeter nor laser tells (paper V: 3 m)
 ASSUMED_RANGE_M = 3.0
 _SEQUENTIAL_REACH = 3
+_BRIDGE_REACH = 16
 
 
 class Plan(NamedTuple):
@@ -103,7 +104,7 @@ def first_pairs(made: Plan, opened: OpenedMission, parameters: Parameters) -> li
     return tasks
 
 
-def loop_pairs(
+def more_pairs(
     made: Plan,
     opened: OpenedMission,
     parameters: Parameters,
@@ -111,11 +112,18 @@ def loop_pairs(
     range_m: np.ndarray,
     known: Sequence[tuple[int, int]],
 ) -> list[PairTask]:
-    """Without navigation: the pairs that overlap by the chained poses and were not tried yet."""
+    """Without navigation: pairs not tried yet that overlap by the chained poses, or may join what is not linked.
+
+    Where the chain is broken, as on the turn to the next line, images of both sides are tried that are near in time.
+    """
     rows = np.array([image.row for image in made.images if image.role != "laser"], int)
     outlines = pairs.footprints(opened.calibration.camera, poses, range_m)
-    tried = set(known)
     found = overlapping(outlines, rows, np.full(len(range_m), 0.1 * float(np.median(range_m))), parameters)
+    linked = poses.known[rows]
+    near = pairs.sequential(len(rows), _BRIDGE_REACH).images
+    bridges = near[linked[near[:, 0]] != linked[near[:, 1]]]
+    found += [(int(rows[a]), int(rows[b])) for a, b in bridges]
+    tried = set(known)
     return [PairTask(i, j, None, None, float(range_m[i]), 0.0) for i, j in found if (i, j) not in tried]
 
 

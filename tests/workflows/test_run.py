@@ -23,7 +23,8 @@ from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.products import PRODUCTS
 from seamosaic.workflows import run as runner
 from seamosaic.workflows.evaluate import evaluate
-from seamosaic.workflows.run import NothingToMap, run
+from seamosaic.workflows.mapping import NothingToMap
+from seamosaic.workflows.run import run
 
 from tests.simulated import small_mission
 

@@ -1,0 +1,193 @@
+"""From poses to maps: which images and pairs touch which tile, and the graphs over the tiles."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from dask.delayed import delayed
+
+from ..tasks import camera as cameras
+from ..tasks import grids, pairs
+from ..tasks.grids import Grid
+from . import maps, products
+from .job import Done
+from .maps import Image, MapJob, Pair, Tile
+from .session import Session, compute
+from .solve import Solution
+
+_LIGHTING_IMAGES = 200
+_GROWTH_TILES = 6
+_RELIEF_SHARE = 0.3
+
+
+class NothingToMap(RuntimeError):
+    """No image of the mission gave a sounding or a match."""
+
+
+def map_tiles(state: Session, posed: products.Posed) -> products.Mapped:
+    """Tiles: cells, surface, mosaics."""
+    job, p = state.job, state.job.parameters
+    images = _images(state, posed)
+    if not images:
+        raise NothingToMap("no image has a pose: there is nothing to map")
+    ranges = np.array([range_of(posed.extracted.get(k), state.plan.range_m[k]) for k in range(len(state.plan.range_m))])
+    typical = float(np.median(ranges[[image.row for image in images]]))
+    gsd = cameras.ground_sample_distance(job.calibration.camera, typical)
+    cell = grids.bathymetry_cell_m(gsd) if p.grid.cell_m == "auto" else float(p.grid.cell_m)
+    mosaic_cell = grids.mosaic_cell_m(gsd) if p.mosaic.cell_m == "auto" else float(p.mosaic.cell_m)
+    reach = max(1.0, typical / 3) if p.grid.max_interpolation_m == "auto" else float(p.grid.max_interpolation_m)
+    m = MapJob(job, state.plan.frame, posed.adjusted.key, reach)
+    outlines = _outlines(state, posed.solution, ranges)
+    surface_tiles = _surface(state, m, posed, images, outlines, cell)
+    textured = [image for image in images if image.texture]
+    light = _lighting(state, textured)
+    ortho, planar = _mosaics(state, m, textured, outlines, surface_tiles, mosaic_cell, light, posed)
+    return products.Mapped(m, cell, mosaic_cell, surface_tiles, ortho, planar, outlines)
+
+
+def _images(state: Session, posed: products.Posed) -> list[Image]:
+    """Images with a pose whose extraction went well."""
+    known = posed.solution.poses.known
+    return [
+        Image(image.row, image.path, image.sha256, posed.extracted[image.row].key, image.role != "laser")
+        for image in state.plan.images
+        if known[image.row] and not posed.extracted[image.row].info["status"]
+    ]
+
+
+def _outlines(state: Session, solution: Solution, ranges: np.ndarray) -> np.ndarray:
+    """Footprints (n, M, 2) in map coordinates, NaN without pose."""
+    poses = solution.poses
+    local = pairs.footprints(state.job.calibration.camera, poses, ranges)
+    shape = local.shape
+    ground = np.repeat((poses.C_local[:, 2] - ranges)[:, None], shape[1], axis=1)
+    points = np.dstack([local, ground]).reshape(-1, 3)
+    known = np.isfinite(points).all(1)
+    result = np.full((len(points), 2), np.nan)
+    result[known] = state.plan.frame.map_from_local(points[known])[:, :2]
+    return result.reshape(shape)
+
+
+def _touching(outlines: np.ndarray, images: Sequence[Image], grid: Grid, margin_m: float) -> tuple[Image, ...]:
+    """Images whose footprint, grown by a margin, touches the grid."""
+    west, south, east, north = grid.bounds
+    corners = outlines[[image.row for image in images]]
+    near = (corners.min(1) <= (east + margin_m, north + margin_m)).all(1)
+    near &= (corners.max(1) >= (west - margin_m, south - margin_m)).all(1)
+    return tuple(image for image, touches in zip(images, near, strict=True) if touches)
+
+
+def _margin(outlines: np.ndarray, images: Sequence[Image]) -> float:
+    """What relief may add to a footprint on level ground: a share of its size, metres."""
+    corners = outlines[[image.row for image in images]]
+    return _RELIEF_SHARE * float(np.median(corners.max(1) - corners.min(1))) if len(corners) else 0.0
+
+
+def _bounds(outlines: np.ndarray, images: Sequence[Image]) -> grids.Bounds:
+    points = outlines[[image.row for image in images]].reshape(-1, 2)
+    (west, south), (east, north) = points.min(0), points.max(0)
+    return grids.Bounds(float(west), float(south), float(east), float(north))
+
+
+def _pairs_of(posed: products.Posed, rows: set[int]) -> tuple[Pair, ...]:
+    keys = {(i, j): done.key for i, j, done in posed.matched}
+    return tuple(
+        Pair(int(i), int(j), keys[int(i), int(j)]) for i, j in posed.solution.pairs if int(i) in rows or int(j) in rows
+    )
+
+
+def _surface(
+    state: Session, m: MapJob, posed: products.Posed, images: Sequence[Image], outlines: np.ndarray, cell: float
+) -> products.Tiles:
+    """Bathymetry: cells of each tile, the law of interpolation, then the surface of each tile."""
+    size = state.job.parameters.grid.tile_cells
+    margin = _margin(outlines, images)
+    bounds = _bounds(outlines, images)
+    grid = grids.pad(grids.grid_around(bounds, cell), 2)
+    steps = (maps.CELLS, maps.GROWTH, maps.SURFACE)
+    for step in steps:
+        state.ledger.begin(step)
+    tiles = list(grids.tiles(grid, size))
+    cell_tasks = []
+    for k, tile in enumerate(tiles):
+        touching = _touching(outlines, images, tile, margin)
+        described = Tile(tile, touching, _pairs_of(posed, {image.row for image in touching}))
+        cell_tasks.append(delayed(maps.cells_tile)(m, described, dask_key_name=f"cells-{k}"))
+    cells: list[Done] = compute(state, maps.CELLS, cell_tasks)
+    if not any(done.info["sounded"] for done in cells):
+        raise NothingToMap("no image gave a laser sounding or a match with another: there is nothing to map")
+    order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:_GROWTH_TILES]
+    sampled = [(tiles[k], cells[k]) for k in sorted(order)]
+    (growth,) = compute(state, maps.GROWTH, [delayed(maps.fit_growth)(m, sampled, dask_key_name="growth")])
+    halo = maps.surface.halo_cells(m.max_interpolation_m, cell)
+    surface_tasks = []
+    for k, tile in enumerate(tiles):
+        around = grids.pad(tile, halo)
+        near = [(t, done) for t, done in zip(tiles, cells, strict=True) if grids.intersection(around, t)]
+        surface_tasks.append(delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=f"surface-{k}"))
+    surfaces: list[Done] = compute(state, maps.SURFACE, surface_tasks)
+    for step, done in zip(steps, (cells, [growth], surfaces), strict=True):
+        state.ledger.end(step, done)
+    return products.Tiles(grid, tuple(zip(tiles, surfaces, strict=True)))
+
+
+def _lighting(state: Session, images: Sequence[Image]) -> Done | None:
+    if state.job.parameters.mosaic.colour == "none" or not images:
+        return None
+    state.ledger.begin(maps.LIGHTING)
+    every = max(1, len(images) // _LIGHTING_IMAGES)
+    task = delayed(maps.lighting)(state.job, list(images[::every]), dask_key_name="lighting")
+    (light,) = compute(state, maps.LIGHTING, [task])
+    state.ledger.end(maps.LIGHTING, [light])
+    return light
+
+
+def _mosaics(
+    state: Session,
+    m: MapJob,
+    images: Sequence[Image],
+    outlines: np.ndarray,
+    ground: products.Tiles,
+    cell: float,
+    light: Done | None,
+    posed: products.Posed,
+) -> tuple[products.Tiles, products.Tiles]:
+    """Orthomosaic and planar mosaic on one grid."""
+    shown = images or _images(state, posed)
+    grid = grids.grid_around(_bounds(outlines, shown), cell)
+    steps = (maps.ORTHOMOSAIC, maps.ALIGN, maps.PLANAR)
+    for step in steps:
+        state.ledger.begin(step)
+    align_task = delayed(maps.align_planar)(
+        m, list(images), _pairs_of(posed, {image.row for image in images}), _ground(posed), dask_key_name="planar-align"
+    )
+    (aligned,) = compute(state, maps.ALIGN, [align_task])
+    tiles = list(grids.tiles(grid, state.job.parameters.mosaic.tile_cells))
+    margin = _margin(outlines, images)
+    ortho_tasks, planar_tasks = [], []
+    for k, tile in enumerate(tiles):
+        described = Tile(tile, _touching(outlines, images, tile, margin))
+        around = grids.pad(
+            grids.grid_around(tile.bounds, ground.grid.cell_m), round(m.max_interpolation_m / ground.grid.cell_m)
+        )
+        near = [(t, done) for t, done in ground.tiles if grids.intersection(around, t)]
+        ortho_tasks.append(delayed(maps.orthomosaic_tile)(m, described, near, light, dask_key_name=f"orthomosaic-{k}"))
+        planar_tasks.append(delayed(maps.planar_tile)(m, described, aligned, light, dask_key_name=f"planar-{k}"))
+    done = compute(state, "mosaics", [*ortho_tasks, *planar_tasks])
+    ortho, planar = done[: len(tiles)], done[len(tiles) :]
+    for step, results in zip(steps, (ortho, [aligned], planar), strict=True):
+        state.ledger.end(step, results)
+    return (
+        products.Tiles(grid, tuple(zip(tiles, ortho, strict=True))),
+        products.Tiles(grid, tuple(zip(tiles, planar, strict=True))),
+    )
+
+
+def _ground(posed: products.Posed) -> dict[int, float]:
+    """Range by the laser of the images that have one."""
+    return {row: float(done.info["range_m"]) for row, done in posed.extracted.items() if done.info.get("range_m")}
+
+
+def range_of(done: Done | None, fallback: float) -> float:
+    """Height of a camera above the seabed by its laser, or else by what is known otherwise, metres."""
+    value = done.info.get("range_m") if done else None
+    return float(value) if value else float(fallback)
