@@ -23,7 +23,7 @@ from rasterio.windows import Window
 NODATA_M: Final = -9999.0
 _BLOCK: Final = 512
 _JPEG_QUALITY: Final = 90
-_CACHE_MB: Final = 128  # of blocks; by default GDAL takes a twentieth of the machine
+_CACHE_BYTES: Final = 128 * 1024 * 1024  # rasterio hands the number to GDAL as bytes
 _HISTOGRAM_BINS: Final = 65536
 
 # What GeoTIFF keys can carry of an engineering CRS, so that it comes back from a file as it went in.
@@ -214,7 +214,7 @@ def gdal_settings() -> rasterio.Env:
 
     The size of the cache holds for the process, from its first use of GDAL.
     """
-    return rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_PAM_ENABLED=False, GDAL_CACHEMAX=_CACHE_MB)
+    return rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_PAM_ENABLED=False, GDAL_CACHEMAX=_CACHE_BYTES)
 
 
 def product_writer(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from ..schemas.parameters import AdjustParameters
 from .motion import Motion
@@ -122,7 +122,7 @@ def _chain(count: int, links: list[Link], R_first: Array) -> Poses:
     _, label = connected_components(graph, directed=False)
     root = int(np.flatnonzero(label == np.bincount(label).argmax())[0])
     R[root], C[root] = R_first, 0.0
-    order, parent = breadth_first_order(graph, root, directed=False)
+    order, parent = breadth_first_order(minimum_spanning_tree(graph), root, directed=False)
     for node in order[1:]:
         base = int(parent[node])
         if base < node:

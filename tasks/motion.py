@@ -22,6 +22,7 @@ Array = NDArray[Any]
 _PIXEL_SIGMA = 0.5  # of a SIFT match, pixels at full resolution
 _SCALE_RADIUS = 0.03  # slope within which a sounding tells a feature's depth: 9 cm at 3 m
 _MIN_SCALE_FEATURES = 5
+_LASER_CONTRADICTS = 0.1  # spread of the depth ratios beyond which a motion is not the right one
 _UNIT_LENGTH_SIGMA = 1e-3
 _MAX_MATCHES = 1500
 
@@ -109,18 +110,52 @@ def estimate(
     start = None if plane is None else _from_homography(x_i, x_j, plane, focal_px, parameters)
     if start is not None and plane is not None:
         return _refine_on_plane(x_i, x_j, start, plane, focal_px, parameters)
-    start = _from_essential(x_i, x_j, focal_px, parameters)
-    if start is not None and prior is not None and not _compatible(start, prior):
-        start = _from_prior(x_i, x_j, prior, focal_px, parameters)
-    if start is None:
-        return None
-    return _refine_epipolar(x_i, x_j, start, laser_i, laser_j, focal_px, parameters, prior)
+    found = [
+        _refine_epipolar(x_i, x_j, start, laser_i, laser_j, focal_px, parameters, prior)
+        for start in _starts(x_i, x_j, focal_px, parameters, prior)
+    ]
+    return max((motion for motion in found if motion is not None), key=_credit, default=None)
+
+
+def _credit(motion: Motion) -> tuple[bool, float]:
+    """Motions that the laser speaks of first, the one it contradicts least; then the one with most matches."""
+    return motion.metric, -motion.scale_sigma if motion.metric else len(motion.inliers)
 
 
 class _Start(NamedTuple):
     R_i_j: Array
     t_i_j: Array
     inliers: NDArray[np.intp]
+
+
+def _starts(
+    x_i: Array, x_j: Array, focal_px: float, parameters: MatchParameters, prior: RelativePrior | None
+) -> list[_Start]:
+    """Where to begin: with the essential matrix, or with navigation where the two disagree.
+
+    Without navigation nothing tells whether the essential matrix fell for the plane that most points lie on; the
+    decompositions of their homography are tried as well.
+    """
+    start = _from_essential(x_i, x_j, focal_px, parameters)
+    if prior is not None and start is not None and not _compatible(start, prior):
+        start = _from_prior(x_i, x_j, prior, focal_px, parameters)
+    others = [] if prior is not None else _from_unknown_plane(x_i, x_j, focal_px, parameters)
+    return [begin for begin in (start, *others) if begin is not None]
+
+
+def _from_unknown_plane(x_i: Array, x_j: Array, focal_px: float, parameters: MatchParameters) -> list[_Start]:
+    """Decompositions of the homography whose plane lies in front of the camera."""
+    H, mask = cv2.findHomography(x_i, x_j, cv2.RANSAC, parameters.inlier_px / focal_px, maxIters=2000, confidence=0.999)
+    if H is None or mask.sum() < parameters.min_inliers:
+        return []
+    inliers = np.flatnonzero(mask.ravel())
+    _, rotations, translations, normals = cv2.decomposeHomographyMat(H, np.eye(3))
+    starts = []
+    for R_j_i, t_j_i, normal in zip(rotations, translations, normals, strict=True):
+        length = float(np.linalg.norm(t_j_i))
+        if length > 1e-6 and (_homogeneous(x_i[inliers]) @ normal.ravel() > 0).mean() > 0.5:
+            starts.append(_Start(R_j_i.T, -R_j_i.T @ t_j_i.ravel() / length, inliers))
+    return starts
 
 
 def _from_homography(x_i: Array, x_j: Array, plane: Plane, focal_px: float, parameters: MatchParameters):
@@ -238,8 +273,10 @@ def _refine_epipolar(
     inliers, depth_i, depth_j = (a[(depth_i > 0) & (depth_j > 0)] for a in (inliers, depth_i, depth_j))
     if len(inliers) < parameters.min_inliers:
         return None
-    scale, scale_sigma = laser_scale([(x_i[inliers], depth_i, laser_i), (x_j[inliers], depth_j, laser_j)])
+    scale, scale_sigma, spread = laser_scale([(x_i[inliers], depth_i, laser_i), (x_j[inliers], depth_j, laser_j)])
     metric = bool(np.isfinite(scale))
+    if metric and spread > _LASER_CONTRADICTS:
+        return None
     covariance = _epipolar_covariance(solution, scale_sigma if metric else _UNIT_LENGTH_SIGMA, prior is not None)
     if metric:
         t = t * scale
@@ -304,11 +341,19 @@ def depths(x_i: Array, x_j: Array, R_i_j: Array, t_i_j: Array) -> tuple[Array, A
     return (c * e - b * f) / safe, (b * e - a * f) / safe
 
 
-def laser_scale(views: list[tuple[Array, Array, Array]]) -> tuple[float, float]:
-    """Scale of a motion and its relative sigma from (slopes (N, 2), depths (N,), soundings (L, 3)) of each image.
+class Scale(NamedTuple):
+    """What the laser says of a motion's length: the factor, its relative sigma, and the votes' relative spread."""
+
+    scale: float
+    sigma: float
+    spread: float
+
+
+def laser_scale(views: list[tuple[Array, Array, Array]]) -> Scale:
+    """Scale of a motion from (slopes (N, 2), depths (N,), soundings (L, 3)) of each image.
 
     The paper takes the one feature nearest to a laser point; here every feature within a small angle of soundings
-    votes with the logarithm of the depth ratio, and the weighted median decides. nan, nan where there are too few.
+    votes with the logarithm of the depth ratio, and the weighted median decides. All nan where there are too few.
     """
     logs, weights = [np.zeros(0)], [np.zeros(0)]
     for x, depth, soundings in views:
@@ -322,11 +367,12 @@ def laser_scale(views: list[tuple[Array, Array, Array]]) -> tuple[float, float]:
             weights.append(1 / (0.005**2 + (0.3 * distance[near, 0]) ** 2))
     ratio, weight = np.concatenate(logs), np.concatenate(weights)
     if len(ratio) < _MIN_SCALE_FEATURES:
-        return float("nan"), float("nan")
+        return Scale(float("nan"), float("nan"), float("nan"))
     median = _weighted_median(ratio, weight)
     spread = 1.4826 * _weighted_median(np.abs(ratio - median), weight)
     effective = weight.sum() ** 2 / (weight**2).sum()
-    return float(np.exp(median)), float(max(spread, 0.002) * 1.2533 / np.sqrt(effective) + 5e-4)
+    sigma = max(spread, 0.002) * 1.2533 / np.sqrt(effective) + 5e-4
+    return Scale(float(np.exp(median)), float(sigma), spread)
 
 
 def _weighted_median(values: Array, weights: Array) -> float:
