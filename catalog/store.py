@@ -4,6 +4,7 @@ A digest that exists is never computed again; there is no other notion of freshn
 named arrays and a JSON text; it appears whole or not at all, and one that cannot be read counts as absent.
 """
 
+import contextlib
 import hashlib
 import io
 import json
@@ -20,6 +21,7 @@ from fsspec.implementations.local import LocalFileSystem
 from numpy.typing import NDArray
 
 _INFO = "info.json"
+_UNREADABLE = (FileNotFoundError, zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError)
 
 
 def digest(step: str, code_version: str, inputs: Iterable[str], parameters: Any) -> str:
@@ -53,10 +55,23 @@ class Store(NamedTuple):
         try:
             with filesystem.open(path, "rb") as file:
                 return _unpack(file.read())
-        except FileNotFoundError:
+        except _UNREADABLE:
             return None
-        except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError):
+
+    def info(self, step: str, key: str) -> dict[str, Any] | None:
+        """The record of a result without its arrays, or None when there is none or its directory is damaged."""
+        filesystem, path = fsspec.url_to_fs(self.path(step, key))
+        try:
+            with filesystem.open(path, "rb") as file, zipfile.ZipFile(file) as archive:
+                return json.loads(archive.read(_INFO))
+        except _UNREADABLE:
             return None
+
+    def remove(self, step: str, key: str) -> None:
+        """Forget a result, so that the next run makes it again."""
+        filesystem, path = fsspec.url_to_fs(self.path(step, key))
+        with contextlib.suppress(FileNotFoundError):
+            filesystem.rm_file(path)
 
     def put(
         self, step: str, key: str, arrays: Mapping[str, NDArray], info: Mapping[str, Any], compress: bool = False

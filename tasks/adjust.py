@@ -79,6 +79,8 @@ def adjust(
     kept = {(link.i, link.j) for link in usable}
     poses = _poses(values, start)
     sigma_m, sigma_tilt = _sigmas(_total(graph, usable, kernel), values, poses)
+    if navigation is not None:  # roll and pitch err by a bias too, which no number of images averages down
+        sigma_tilt = np.hypot(sigma_tilt, navigation.sigma_attitude[:, :2].mean(1))
     return Adjusted(
         poses=poses,
         sigma_m=sigma_m,
@@ -147,8 +149,8 @@ def _navigation_factors(navigation: NavigationPrior) -> Any:
 
     A navigation variable keeps navigation's attitude and depth; its horizontal position is that of the camera. So
     steps are held in the local frame, whatever the heading sensor's error, and the shape of the track helps to
-    orient the map. Offset and attitude biases are shared by the whole track: n priors together weigh as much as
-    one measurement of the stated sigma.
+    orient the map. Offset and heading bias are shared by the whole track: n priors together weigh as much as one
+    measurement of the stated sigma.
     """
     graph = gtsam.NonlinearFactorGraph()
     poses = navigation.poses
@@ -158,7 +160,7 @@ def _navigation_factors(navigation: NavigationPrior) -> Any:
         R, own = poses.R_local_camera[k], _pose(poses.R_local_camera[k], poses.C_local[k])
         offset = navigation.sigma_horizontal[k] * np.sqrt(count)
         graph.add(gtsam.PriorFactorPose3(_of_navigation(k), own, _noise(_EXACT_RAD, R, offset, _EXACT_M)))
-        attitude = _attitude(navigation, k) * count
+        attitude = _attitude(navigation, k, count)
         tie = _noise(attitude, R, _EXACT_M, float(navigation.sigma_depth[k]))
         graph.add(gtsam.BetweenFactorPose3(_of_navigation(k), k, gtsam.Pose3(), tie))
     for a, b in itertools.pairwise(known):
@@ -175,10 +177,10 @@ def _of_navigation(k: int) -> int:
     return gtsam.symbol("n", k)
 
 
-def _attitude(navigation: NavigationPrior, k: int) -> Array:
-    """Covariance (3, 3) of navigation's attitude about the camera's axes."""
+def _attitude(navigation: NavigationPrior, k: int, count: int) -> Array:
+    """Covariance (3, 3) of navigation's attitude about the camera's axes; the heading's error is the track's."""
     R = navigation.R_camera_vehicle
-    return R @ np.diag(navigation.sigma_attitude[k] ** 2) @ R.T
+    return R @ np.diag(navigation.sigma_attitude[k] ** 2 * [1, 1, count]) @ R.T
 
 
 def _noise(rotation: Array | float, R_local_camera: Array, horizontal_m: float, vertical_m: float) -> Any:

@@ -18,6 +18,8 @@ from .rotations import nearest_rotation
 
 Array = NDArray[np.float64]
 
+_WGS84 = "EPSG:4326"  # navigation's datum, whatever the map's
+
 
 class LocalAffine(NamedTuple):
     """The map around one place: local = matrix @ map + offset, good to a micrometre over some tens of metres."""
@@ -48,10 +50,7 @@ class MapFrame:
     @cached_property
     def _geographic_from_map(self) -> pyproj.Transformer:
         assert self.crs is not None
-        crs = pyproj.CRS(self.crs)
-        geographic = crs.geodetic_crs
-        assert geographic is not None
-        return pyproj.Transformer.from_crs(crs, pyproj.CRS(geographic.to_2d()), always_xy=True)
+        return pyproj.Transformer.from_crs(pyproj.CRS(self.crs), _WGS84, always_xy=True)
 
     @cached_property
     def _local_from_geographic(self) -> pyproj.Transformer:

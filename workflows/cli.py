@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.table import Table
+from rich.text import Text
 
 from ..schemas.problems import InvalidInput
 from .job import log
@@ -84,7 +85,7 @@ def simulate(
     from . import simulate as simulator
 
     path = simulator.simulate(scene, out, seed, **_overrides(images, width))
-    _console.print(f"{scene} mission with its truth in {path}")
+    _console.print(Text(f"{scene} mission with its truth in {path}"))
 
 
 @app.command()
@@ -117,8 +118,8 @@ def demo(out: Annotated[Path, typer.Argument(metavar="OUT", help="A new or an ea
     measured = evaluator.evaluate(result.path, mission)
     _console.print("Against the simulation's truth:")
     _console.print_json(json.dumps(measured))
-    _console.print(f"\nLook at [bold]{result.path / 'report.html'}[/bold] in a browser,")
-    _console.print(f"and open {result.path / 'bathymetry.tif'} and {result.path / 'mosaic.tif'} in QGIS.")
+    _console.print(Text(f"\nLook at {result.path / 'report.html'} in a browser,"))
+    _console.print(Text(f"and open {result.path / 'bathymetry.tif'} and {result.path / 'mosaic.tif'} in QGIS."))
 
 
 def _overrides(images: int | None, width: int | None) -> dict[str, Any]:
@@ -142,7 +143,9 @@ def _parameters(params: Path | None, overrides: list[str] | None):
 
 def _print_result(result: Any) -> None:
     quality = result.quality
-    table = Table(title=f"{quality.mission.id}: {'new version' if result.new else 'nothing changed,'} {result.path}")
+    table = Table(
+        title=Text(f"{quality.mission.id}: {'new version' if result.new else 'nothing changed,'} {result.path}")
+    )
     table.add_column("step")
     for name in ("computed", "reused", "core seconds"):
         table.add_column(name, justify="right")
@@ -154,7 +157,7 @@ def _print_result(result: Any) -> None:
         figures.add_row(name, value)
     _console.print(figures)
     for warning in quality.warnings:
-        _console.print(f"[yellow]warning[/yellow] {warning}")
+        _console.print(Text("warning: ", "yellow") + Text(warning))
 
 
 def _figures(quality: Any):
@@ -192,9 +195,9 @@ def main() -> None:
     except KeyboardInterrupt:
         _errors.print("Stopped. Run the same command again to go on from here.")
         sys.exit(FAILED)
-    except (RuntimeError, OSError) as error:
+    except Exception as error:  # the last resort: a message for the user, the traceback with --verbose
         log.debug("failed", exc_info=True)
-        _errors.print(f"[red]failed[/red] {error}")
+        _errors.print(Text("failed ", "red") + Text(str(error)))
         sys.exit(FAILED)
 
 

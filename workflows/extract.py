@@ -1,5 +1,6 @@
 """Per image: decoded once; laser soundings, features and colour statistics into the store."""
 
+import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,11 +10,11 @@ import numpy as np
 from ..catalog.images import UnreadableImage, read_image
 from ..schemas.calibration import Laser
 from ..schemas.mission import Role
-from ..tasks import camera, colour, cross, features, laser, triangulation
+from ..tasks import colour, features, laser, triangulation
 from .job import Done, Job, Made, code_version, log, once, stage
 
 STEP = "extract"
-VERSION = code_version(camera, colour, cross, features, laser, triangulation)
+VERSION = code_version(sys.modules[__name__])
 
 
 class ImageTask(NamedTuple):
@@ -42,15 +43,36 @@ def _extract(job: Job, image: ImageTask) -> Done:
 
     def make() -> Made:
         try:
-            decoded = read_image(job.mission_url, image.path, calibration.camera)
-            if decoded.sha256 != image.sha256:
-                raise UnreadableImage("the file changed while the mission was being processed")
-        except (UnreadableImage, OSError) as error:
-            log.warning("mission=%s step=%s image=%s rejected: %s", job.mission_id, STEP, image.path, error)
-            return Made({}, {"status": f"rejected: {error}", "soundings": 0, "features": 0})
-        return _measure(job, image.role, light, decoded.bgr)
+            bgr = read_verified(job, image.path, image.sha256)
+        except UnreadableImage as error:
+            return Made({}, _rejected(job, image, error))
+        return _measure(job, image.role, light, bgr)
 
-    return once(job, STEP, VERSION, [image.sha256], parameters, make)
+    try:
+        return once(job, STEP, VERSION, [image.sha256], parameters, make)
+    except OSError as error:  # not the image's fault, so not to be remembered: the next run tries again
+        return Done(STEP, "", True, 0.0, _rejected(job, image, error))
+
+
+def _rejected(job: Job, image: ImageTask, error: Exception) -> dict:
+    log.warning("mission=%s step=%s image=%s rejected: %s", job.mission_id, STEP, image.path, error)
+    return {"status": f"rejected: {error}", "soundings": 0, "features": 0}
+
+
+def read_verified(job: Job, path: str, sha256: str) -> np.ndarray:
+    """An image (H, W, 3) BGR, if it still is the one that was opened.
+
+    Raises
+    ------
+    UnreadableImage
+        It cannot be decoded.
+    OSError
+        It cannot be read now, or it changed since.
+    """
+    decoded = read_image(job.mission_url, path, job.calibration.camera)
+    if decoded.sha256 != sha256:
+        raise OSError(f"{path} changed while the mission was being processed; run again")
+    return decoded.bgr
 
 
 def _measure(job: Job, role: Role, light: Laser | None, bgr: np.ndarray) -> Made:

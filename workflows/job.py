@@ -3,8 +3,10 @@
 import hashlib
 import inspect
 import logging
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import version
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -17,6 +19,10 @@ from ..schemas.calibration import Calibration
 from ..schemas.parameters import Parameters
 
 log = logging.getLogger("seamosaic")
+
+_OURS = __package__.rpartition(".")[0] if __package__ else ""
+_FOLLOWED = tuple(f"{_OURS}.{name}" for name in ("tasks", "catalog.image", "schemas.calibration"))
+_LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "gtsam", "pyproj")
 
 
 class Job(NamedTuple):
@@ -53,9 +59,25 @@ class Made(NamedTuple):
 
 
 def code_version(*modules: ModuleType) -> str:
-    """Digest of the modules' source: a step's results are stale when the code that makes them changed."""
-    text = "".join(inspect.getsource(module) for module in modules)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    """Digest of the code behind a step: these modules, all of `tasks` and `catalog.images` that they use, the
+    calibration's model, and the versions of the libraries that compute. A change makes the step's results stale."""
+    seen: dict[str, ModuleType] = {}
+    for module in modules:
+        _follow(module, seen)
+    text = "".join(inspect.getsource(seen[name]) for name in sorted(seen))
+    libraries = ",".join(f"{name}={version(name)}" for name in _LIBRARIES)
+    return hashlib.sha256((text + libraries).encode()).hexdigest()[:16]
+
+
+def _follow(module: ModuleType, seen: dict[str, ModuleType]) -> None:
+    """Add a module and those of ours that compute and that it takes names from."""
+    if module.__name__ in seen:
+        return
+    seen[module.__name__] = module
+    for value in vars(module).values():
+        name = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
+        if isinstance(name, str) and name.startswith(_FOLLOWED) and name in sys.modules:
+            _follow(sys.modules[name], seen)
 
 
 def stage(*models: Model) -> list[Any]:
@@ -75,17 +97,17 @@ def array_digest(*arrays: NDArray) -> str:
 def once(
     job: Job,
     step: str,
-    version: str,
+    code: str,
     inputs: Sequence[str],
     parameters: Any,
     make: Callable[[], Made],
     compress: bool = False,
 ) -> Done:
     """The stored result of a step, made now if the store does not have it."""
-    key = digest(step, version, inputs, parameters)
-    entry = job.store.get(step, key)
-    if entry is not None:
-        return Done(step, key, False, float(entry.info["seconds"]), entry.info)
+    key = digest(step, code, inputs, parameters)
+    known = job.store.info(step, key)
+    if known is not None:
+        return Done(step, key, False, float(known["seconds"]), known)
     started = time.process_time()
     made = make()
     seconds = time.process_time() - started
@@ -105,6 +127,7 @@ def load(job: Job, step: str, key: str) -> Entry:
     """
     entry = job.store.get(step, key)
     if entry is None:
+        job.store.remove(step, key)
         raise LostEntry(f"{job.store.path(step, key)} is gone or damaged; run again to make it anew")
     return entry
 

@@ -40,7 +40,8 @@ def map_tiles(state: Session, posed: products.Posed) -> products.Mapped:
     surface_tiles = _surface(state, m, posed, images, outlines, cell)
     textured = [image for image in images if image.texture]
     light = _lighting(state, textured)
-    ortho, planar = _mosaics(state, m, textured, outlines, surface_tiles, mosaic_cell, light, posed)
+    by_row = {image.row: float(ranges[image.row]) for image in textured}
+    ortho, planar = _mosaics(state, m, textured, outlines, surface_tiles, mosaic_cell, light, posed, by_row)
     return products.Mapped(m, cell, mosaic_cell, surface_tiles, ortho, planar, outlines)
 
 
@@ -88,11 +89,15 @@ def _bounds(outlines: np.ndarray, images: Sequence[Image]) -> grids.Bounds:
     return grids.Bounds(float(west), float(south), float(east), float(north))
 
 
-def _pairs_of(posed: products.Posed, rows: set[int]) -> tuple[Pair, ...]:
+def _linked(posed: products.Posed) -> list[Pair]:
+    """The pairs that hold the adjustment."""
     keys = {(i, j): done.key for i, j, done in posed.matched}
-    return tuple(
-        Pair(int(i), int(j), keys[int(i), int(j)]) for i, j in posed.solution.pairs if int(i) in rows or int(j) in rows
-    )
+    return [Pair(i, j, keys[i, j]) for i, j in posed.solution.pairs.tolist()]
+
+
+def _of_images(linked: Sequence[Pair], images: Sequence[Image]) -> tuple[Pair, ...]:
+    rows = {image.row for image in images}
+    return tuple(pair for pair in linked if pair.i in rows or pair.j in rows)
 
 
 def _surface(
@@ -107,14 +112,17 @@ def _surface(
     for step in steps:
         state.ledger.begin(step)
     tiles = list(grids.tiles(grid, size))
-    cell_tasks = []
+    cell_tasks, linked = [], _linked(posed)
     for k, tile in enumerate(tiles):
         touching = _touching(outlines, images, tile, margin)
-        described = Tile(tile, touching, _pairs_of(posed, {image.row for image in touching}))
+        described = Tile(tile, touching, _of_images(linked, touching))
         cell_tasks.append(delayed(maps.cells_tile)(m, described, dask_key_name=f"cells-{k}"))
     cells: list[Done] = compute(state, maps.CELLS, cell_tasks)
     if not any(done.info["sounded"] for done in cells):
-        raise NothingToMap("no image gave a laser sounding or a match with another: there is nothing to map")
+        raise NothingToMap(
+            "no image gave a laser sounding, and no two images could be linked (without navigation only the laser "
+            "gives links their scale): there is nothing to map"
+        )
     order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:_GROWTH_TILES]
     sampled = [(tiles[k], cells[k]) for k in sorted(order)]
     (growth,) = compute(state, maps.GROWTH, [delayed(maps.fit_growth)(m, sampled, dask_key_name="growth")])
@@ -150,6 +158,7 @@ def _mosaics(
     cell: float,
     light: Done | None,
     posed: products.Posed,
+    ranges: dict[int, float],
 ) -> tuple[products.Tiles, products.Tiles]:
     """Orthomosaic and planar mosaic on one grid."""
     shown = images or _images(state, posed)
@@ -158,7 +167,7 @@ def _mosaics(
     for step in steps:
         state.ledger.begin(step)
     align_task = delayed(maps.align_planar)(
-        m, list(images), _pairs_of(posed, {image.row for image in images}), _ground(posed), dask_key_name="planar-align"
+        m, list(images), _of_images(_linked(posed), images), ranges, dask_key_name="planar-align"
     )
     (aligned,) = compute(state, maps.ALIGN, [align_task])
     tiles = list(grids.tiles(grid, state.job.parameters.mosaic.tile_cells))
@@ -166,9 +175,7 @@ def _mosaics(
     ortho_tasks, planar_tasks = [], []
     for k, tile in enumerate(tiles):
         described = Tile(tile, _touching(outlines, images, tile, margin))
-        around = grids.pad(
-            grids.grid_around(tile.bounds, ground.grid.cell_m), round(m.max_interpolation_m / ground.grid.cell_m)
-        )
+        around = maps.ground_around(tile, ground.grid.cell_m, m.max_interpolation_m)
         near = [(t, done) for t, done in ground.tiles if grids.intersection(around, t)]
         ortho_tasks.append(delayed(maps.orthomosaic_tile)(m, described, near, light, dask_key_name=f"orthomosaic-{k}"))
         planar_tasks.append(delayed(maps.planar_tile)(m, described, aligned, light, dask_key_name=f"planar-{k}"))
@@ -180,11 +187,6 @@ def _mosaics(
         products.Tiles(grid, tuple(zip(tiles, ortho, strict=True))),
         products.Tiles(grid, tuple(zip(tiles, planar, strict=True))),
     )
-
-
-def _ground(posed: products.Posed) -> dict[int, float]:
-    """Range by the laser of the images that have one."""
-    return {row: float(done.info["range_m"]) for row, done in posed.extracted.items() if done.info.get("range_m")}
 
 
 def range_of(done: Done | None, fallback: float) -> float:

@@ -1,12 +1,12 @@
 """Per map tile: soundings to cells, cells to surface, images to mosaics. What touches a tile decides its digest."""
 
+import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-from ..catalog.images import read_image
 from ..catalog.store import Entry
 from ..tasks import (
     camera,
@@ -17,7 +17,6 @@ from ..tasks import (
     laser,
     mosaic,
     planar,
-    projection,
     surface,
     terrain,
     tiepoints,
@@ -29,16 +28,11 @@ from ..tasks.navigation import Poses
 from ..tasks.surface import Growth
 from . import extract, match, solve
 from .job import Done, Job, Made, array_digest, code_version, load, once, stage
-from .plan import ASSUMED_RANGE_M
 from .solve import Solution
 
 CELLS, GROWTH, SURFACE, LIGHTING = "cells", "growth", "surface", "lighting"
 ORTHOMOSAIC, ALIGN, PLANAR = "orthomosaic", "planar-align", "planar-mosaic"
-_CELLS_VERSION = code_version(camera, frames, gridding, grids, tiepoints)
-_SURFACE_VERSION = code_version(gridding, grids, surface)
-_LIGHTING_VERSION = code_version(colour)
-_MOSAIC_VERSION = code_version(camera, colour, frames, grids, laser, mosaic, projection, terrain)
-_PLANAR_VERSION = code_version(camera, colour, frames, grids, laser, mosaic, planar, projection, terrain)
+_VERSION = code_version(sys.modules[__name__])
 
 
 class Image(NamedTuple):
@@ -89,14 +83,14 @@ def cells_tile(m: MapJob, tile: Tile) -> Done:
     inputs += [f"{pair.i}-{pair.j}:{pair.key}" for pair in tile.pairs]
 
     def make() -> Made:
-        parts = [_laser(m, image, solution) for image in tile.images]
+        parts = [_NO_PART, *(_laser(m, image, solution) for image in tile.images)]
         parts += [_matched(m, pair, solution) for pair in tile.pairs]
         X, sigma, source, frame, pose_sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
         X_map = m.frame.map_from_local(X)
         cells = gridding.grid_soundings(tile.grid, X_map, sigma, source.astype(np.uint8), frame, pose_sigma)
         return Made(cells._asdict(), {"sounded": int((cells.density > 0).sum())})
 
-    return once(m.job, CELLS, _CELLS_VERSION, inputs, _context(m, tile), make, compress=True)
+    return once(m.job, CELLS, _VERSION, inputs, _context(m, tile), make, compress=True)
 
 
 def _context(m: MapJob, tile: Tile) -> list[Any]:
@@ -112,6 +106,7 @@ def _pose_digest(solution: Solution, tile: Tile) -> str:
 
 
 Part = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+_NO_PART: Part = (np.zeros((0, 3)), np.zeros(0), np.zeros(0, int), np.zeros(0, int), np.zeros(0))
 
 
 def _laser(m: MapJob, image: Image, solution: Solution) -> Part:
@@ -128,6 +123,11 @@ def _laser(m: MapJob, image: Image, solution: Solution) -> Part:
 
 def _matched(m: MapJob, pair: Pair, solution: Solution) -> Part:
     entry = load(m.job, match.STEP, pair.key)
+    covariance = entry.arrays["covariance"].copy()
+    if not entry.info["metric"]:  # stated for a baseline of unit length
+        baseline = float(np.linalg.norm(solution.poses.C_local[pair.j] - solution.poses.C_local[pair.i]))
+        covariance[3:] *= baseline
+        covariance[:, 3:] *= baseline
     points = tiepoints.triangulate(
         m.job.calibration.camera,
         entry.arrays["uv_i"].astype(float),
@@ -135,7 +135,7 @@ def _matched(m: MapJob, pair: Pair, solution: Solution) -> Part:
         solution.poses,
         pair.i,
         pair.j,
-        entry.arrays["covariance"],
+        covariance,
     )
     count = len(points.X_local)
     shared = np.hypot(solution.sigma_m[pair.i, 2], points.common_sigma_m)
@@ -153,7 +153,7 @@ def fit_growth(m: MapJob, tiles: Sequence[tuple[Grid, Done]]) -> Done:
         return Made({}, surface.fit_growth(joined)._asdict())
 
     inputs = [done.key for _, done in tiles]
-    return once(m.job, GROWTH, _SURFACE_VERSION, inputs, [m.max_interpolation_m], make)
+    return once(m.job, GROWTH, _VERSION, inputs, [m.max_interpolation_m], make)
 
 
 def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]], growth: Done) -> Done:
@@ -176,7 +176,7 @@ def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]],
         return Made(cut, {"cells": int(np.isfinite(cut["elevation"]).sum())})
 
     parameters = [list(tile), m.max_interpolation_m, list(law)]
-    return once(m.job, SURFACE, _SURFACE_VERSION, inputs, parameters, make, compress=True)
+    return once(m.job, SURFACE, _VERSION, inputs, parameters, make, compress=True)
 
 
 def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]]) -> Cells:
@@ -210,7 +210,7 @@ def lighting(job: Job, images: Sequence[Image]) -> Done:
         thumbnails = [load(job, extract.STEP, image.key).arrays["thumbnail"] for image in images]
         return Made({"pattern": colour.lighting(np.stack(thumbnails))}, {"images": len(images)})
 
-    return once(job, LIGHTING, _LIGHTING_VERSION, [image.key for image in images], [], make)
+    return once(job, LIGHTING, _VERSION, [image.key for image in images], [], make)
 
 
 def orthomosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], light: Done | None) -> Done:
@@ -220,7 +220,7 @@ def orthomosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]],
 
     def make() -> Made:
         cell = ground[0][0].cell_m
-        around = grids.pad(grids.grid_around(tile.grid.bounds, cell), max(3, round(m.max_interpolation_m / cell)))
+        around = ground_around(tile.grid, cell, m.max_interpolation_m)
         elevation = np.full(around.shape, np.nan)
         for grid, done in ground:
             paste(around, elevation, grid, load(m.job, SURFACE, done.key).arrays["elevation"])
@@ -231,7 +231,12 @@ def orthomosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]],
                 canvas = mosaic.add_view(canvas, view)
         return _finished(mosaic.finish(canvas))
 
-    return once(m.job, ORTHOMOSAIC, _MOSAIC_VERSION, inputs, _mosaic_context(m, tile), make, compress=True)
+    return once(m.job, ORTHOMOSAIC, _VERSION, inputs, _mosaic_context(m, tile), make, compress=True)
+
+
+def ground_around(tile: Grid, cell_m: float, max_interpolation_m: float) -> Grid:
+    """The bathymetry that a mosaic tile needs: its own ground, and as far around as terrain may hide it."""
+    return grids.pad(grids.grid_around(tile.bounds, cell_m), max(3, round(max_interpolation_m / cell_m)))
 
 
 def _mosaic_inputs(tile: Tile, solution: Solution, light: Done | None) -> list[str]:
@@ -259,7 +264,7 @@ def _views(job: Job, tile: Tile, poses: Poses, light: Done | None):
     cv2.setNumThreads(1)
     pattern = load(job, LIGHTING, light.key).arrays["pattern"] if light else None
     for image in tile.images:
-        bgr = read_image(job.mission_url, image.path, job.calibration.camera).bgr
+        bgr = extract.read_verified(job, image.path, image.sha256)
         entry = load(job, extract.STEP, image.key)
         erase = _erased(entry, bgr.shape[:2])
         flat = bgr if pattern is None else colour.flatten(bgr, pattern)
@@ -282,7 +287,7 @@ def _erased(entry: Entry, shape: tuple[int, int]) -> np.ndarray:
 def align_planar(m: MapJob, images: Sequence[Image], linked: Sequence[Pair], ranges: dict[int, float]) -> Done:
     """Similarities of all images on the plane of the planar-scene hypothesis.
 
-    ranges : height of the camera above the seabed by the laser, for the rows that have one.
+    ranges : height of the camera above the seabed, by row.
     """
     solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
     whole = Tile(Grid(1.0, 0, 0, 1, 1), tuple(images), tuple(linked))
@@ -293,16 +298,15 @@ def align_planar(m: MapJob, images: Sequence[Image], linked: Sequence[Pair], ran
         if not len(rows):
             return Made({"rows": rows, "similarity": np.zeros((0, 2, 3))}, {})
         C_map = m.frame.map_from_local(solution.poses.C_local[rows])
-        above = [ranges[row] for row in rows.tolist() if row in ranges]
-        height = float(np.median(above)) if above else ASSUMED_RANGE_M
-        seabed = float(np.median([C_map[k, 2] - ranges.get(row, height) for k, row in enumerate(rows.tolist())]))
+        above = np.array([ranges[row] for row in rows.tolist()])
+        height, seabed = float(np.median(above)), float(np.median(C_map[:, 2] - above))
         R_map_local = np.eye(3) if m.frame.crs is None else m.frame.R_map_local(C_map.mean(0))
         believed = planar.prior(C_map, np.maximum(C_map[:, 2] - seabed, 0.1), R_map_local)
         matches = _levelled(m, linked, solution.poses, {int(row): k for k, row in enumerate(rows)}, height)
         return Made({"rows": rows, "similarity": planar.align(believed, matches, 0.1 * height)}, {})
 
     context = [*_mosaic_context(m, whole), sorted(ranges.items())]
-    return once(m.job, ALIGN, _PLANAR_VERSION, inputs, context, make)
+    return once(m.job, ALIGN, _VERSION, inputs, context, make)
 
 
 def _levelled(m: MapJob, linked: Sequence[Pair], poses: Poses, number: dict[int, int], range_m: float):
@@ -334,15 +338,7 @@ def planar_tile(m: MapJob, tile: Tile, aligned: Done, light: Done | None) -> Don
             canvas = planar.add_view(canvas, view, similarity[view.number])
         return _finished(mosaic.finish(canvas))
 
-    return once(m.job, PLANAR, _PLANAR_VERSION, inputs, _mosaic_context(m, tile), make, compress=True)
+    return once(m.job, PLANAR, _VERSION, inputs, _mosaic_context(m, tile), make, compress=True)
 
 
-VERSIONS = {
-    CELLS: _CELLS_VERSION,
-    GROWTH: _SURFACE_VERSION,
-    SURFACE: _SURFACE_VERSION,
-    LIGHTING: _LIGHTING_VERSION,
-    ORTHOMOSAIC: _MOSAIC_VERSION,
-    ALIGN: _PLANAR_VERSION,
-    PLANAR: _PLANAR_VERSION,
-}
+VERSIONS = dict.fromkeys((CELLS, GROWTH, SURFACE, LIGHTING, ORTHOMOSAIC, ALIGN, PLANAR), _VERSION)

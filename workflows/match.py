@@ -1,5 +1,6 @@
 """Per pair: matches and the metric motion between two images (paper III.E)."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from . import extract
 from .job import Done, Job, Made, array_digest, code_version, load, once, stage
 
 STEP = "match"
-VERSION = code_version(camera, features, motion, pairs)
+VERSION = code_version(sys.modules[__name__])
 
 
 class PairTask(NamedTuple):

@@ -52,6 +52,8 @@ def plan(opened: OpenedMission, parameters: Parameters) -> Plan:
     altitude = frames["altitude"].values.astype(float)
     known = altitude[np.isfinite(altitude)]
     range_m = np.where(np.isfinite(altitude), altitude, np.median(known) if len(known) else ASSUMED_RANGE_M)
+    if len(known):  # the altimeter's range is that of the reference point
+        range_m = range_m - mount.translation[2]
     R_first = navigation.first_camera_without_navigation(mount)
     return Plan(images, frame, prior, np.maximum(range_m, 0.1), R_first)
 
@@ -60,8 +62,10 @@ def _map_frame(opened: OpenedMission) -> MapFrame:
     """The local frame's origin: the mission's middle, rounded so that one image more does not move it much."""
     if opened.crs is None:
         return MapFrame(None)
-    place = [round(float(np.nanmedian(opened.frames[name].values)), 4) for name in ("latitude", "longitude")]
-    return MapFrame(opened.crs, *place)
+    longitude = np.radians(opened.frames["longitude"].values.astype(float))
+    east = np.degrees(np.angle(np.nanmean(np.exp(1j * longitude))))  # the 180th meridian is no edge
+    north = np.nanmedian(opened.frames["latitude"].values)
+    return MapFrame(opened.crs, round(float(north), 4), round(float(east), 4))
 
 
 def _prior(frames: xarray.Dataset, frame: MapFrame, opened: OpenedMission, parameters: Parameters) -> NavigationPrior:
@@ -138,7 +142,7 @@ def overlapping(
 
 def _margin(prior: NavigationPrior) -> np.ndarray:
     """How far a footprint may be from where navigation has it, relative to those of neighbouring lines, (n,) m."""
-    drift = prior.drift_m_per_sqrt_s * np.sqrt(max(float(prior.time_s[-1]), 1.0))
+    drift = prior.drift_m_per_sqrt_s * np.sqrt(max(float(np.nanmax(prior.time_s)), 1.0))
     return np.minimum(prior.sigma_horizontal, drift) / 2
 
 

@@ -1,5 +1,6 @@
 """From stored results to a version's folder: every product of FORMATS, with quality figures and provenance."""
 
+import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
@@ -16,6 +17,7 @@ from ..catalog import meshes, metadata, netcdf, pointclouds, rasters, trajectori
 from ..catalog.mission_files import MissionFiles
 from ..catalog.missions import OpenedMission
 from ..catalog.store import digest
+from ..schemas.mission import Mission
 from ..schemas.products import (
     AxisDifference,
     BathymetryQuality,
@@ -33,14 +35,27 @@ from ..schemas.products import (
 from ..schemas.provenance import InputFile, Provenance, Step
 from ..tasks import mesh, rotations
 from ..tasks.grids import Bounds, Grid
-from . import extract, maps, report
+from . import extract, maps, report, report_figures
 from .job import Done, Job, code_version, load
 from .maps import MapJob
 from .plan import Plan
 from .solve import Solution
 
-_VERSION = code_version(meshes, metadata, netcdf, pointclouds, rasters, trajectories, vectors, mesh, report)
+_VERSION = code_version(
+    sys.modules[__name__],
+    report_figures,
+    meshes,
+    metadata,
+    netcdf,
+    pointclouds,
+    rasters,
+    trajectories,
+    vectors,
+    mesh,
+    report,
+)
 _MESH_CELLS = 2_000_000
+_NAMED_BY = ("image", "role", "time", "status", "sha256")
 
 
 class Posed(NamedTuple):
@@ -89,6 +104,8 @@ def write(results: Results) -> tuple[Path, bool, Quality]:
     keys = [done.key for _, done in (*mapped.surface.tiles, *mapped.orthomosaic.tiles, *mapped.planar.tiles)]
     keys += [done.key for done in results.posed.extracted.values()] + [results.posed.adjusted.key]
     inputs = sorted(f"{name}:{sha}" for name, sha in results.opened.input_digests.items())
+    frames = results.opened.frames
+    inputs += [str(row) for row in zip(*(frames[name].values for name in _NAMED_BY), strict=True)]
     made_from = digest("products", _VERSION, [*inputs, *keys], job.parameters.model_dump(mode="json"))
     writer = versions.new_version(results.out, job.mission_id, made_from)
     if isinstance(writer, Path):
@@ -113,13 +130,28 @@ def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
     provenance = _provenance(results, made_from)
     report.write_report(folder, quality, provenance, None if results.plan.prior is None else navigation)
     if results.opened.crs is not None:
-        times = results.opened.frames["time"].values
+        start, end = _span(results.opened)
         mission = results.opened.mission
-        number = len(versions.list_versions(results.out, mission.id)) + 1
-        metadata.write_stac_item(folder, mission.id, number, mission.title, _utc(times[0]), _utc(times[-1]))
+        newest = versions.newest_version(results.out, mission.id)
+        number = newest.number + 1 if newest else 1
+        metadata.write_stac_item(folder, mission.id, number, mission.title, start, end, _about(mission))
     provenance = provenance.model_copy(update={"outputs": metadata.output_digests(folder)})
     metadata.write_provenance(folder / "metadata" / "provenance.json", provenance)
     return quality
+
+
+def _span(opened: OpenedMission) -> tuple[datetime, datetime]:
+    """First and last exposure; an image without a time has none."""
+    times = opened.frames["time"].values
+    times = times[~np.isnat(times)]
+    return _utc(times.min()), _utc(times.max())
+
+
+def _about(mission: Mission) -> dict[str, str]:
+    """What mission.yaml says of platform, people, licence and place, for the metadata."""
+    given = {} if mission.reporting is None else mission.reporting.model_dump(exclude_none=True)
+    named = {"platform": mission.platform, "license": given.pop("licence", "")}
+    return {name: value for name, value in {**named, **given}.items() if value}
 
 
 def _utc(time: np.datetime64) -> datetime:
@@ -315,14 +347,14 @@ def _quality(
 ) -> Quality:
     opened = results.opened
     roles = Counter(str(role) for role in opened.frames["role"].values)
-    times = opened.frames["time"].values
+    start, end = _span(opened)
     return Quality(
         mission=MissionSummary(
             id=opened.mission.id,
             title=opened.mission.title,
             platform=opened.mission.platform,
-            start=_utc(times[0]),
-            end=_utc(times[-1]),
+            start=start,
+            end=end,
             crs=None if opened.crs is None else pyproj.CRS.from_wkt(opened.crs).name,
             vertical_reference=vertical_reference(opened),
             images=ImageCounts(total=len(rows), by_role=dict(roles), by_status=dict(Counter(row.kind for row in rows))),
@@ -333,8 +365,17 @@ def _quality(
         bathymetry=_bathymetry_quality(folder, results.mapped.cell_m),
         mosaic=_mosaic_quality(results),
         mesh=triangles,
-        warnings=tuple(opened.warnings),
+        warnings=(*opened.warnings, *_doubts(rows, results)),
     )
+
+
+def _doubts(rows: Sequence[trajectories.Row], results: Results) -> Iterator[str]:
+    """What the figures show but a hurried reader may miss."""
+    alone = sum(row.kind == "navigation" for row in rows)
+    if alone:
+        yield f"{alone} of {len(rows)} images are placed by navigation alone: no match with another image holds them"
+    if results.posed.matched and not len(results.posed.solution.pairs):
+        yield f"none of {len(results.posed.matched)} pairs of images could be linked"
 
 
 def _sounding_quality(results: Results, count: int) -> SoundingQuality | None:

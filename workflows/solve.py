@@ -1,19 +1,20 @@
 """Once per mission: all poses from the pair motions and navigation."""
 
+import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ..catalog.store import Entry
-from ..tasks import adjust, motion, navigation
+from ..tasks import adjust
 from ..tasks.adjust import Link
 from ..tasks.navigation import NavigationPrior, Poses
 from . import match
 from .job import Done, Job, Made, array_digest, code_version, load, once, stage
 
 STEP = "adjust"
-VERSION = code_version(adjust, motion, navigation)
+VERSION = code_version(sys.modules[__name__])
 
 
 class Solution(NamedTuple):

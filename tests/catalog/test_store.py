@@ -31,6 +31,10 @@ def test_a_damaged_result_counts_as_absent(tmp_path):
     for damaged in (content[: len(content) // 2], content[:200] + b"\xff" * 40 + content[240:], b""):
         path.write_bytes(damaged)
         assert store.get("extract", "ab12") is None
+    store.remove("extract", "ab12")
+    assert store.info("extract", "ab12") is None
+    store.put("extract", "ab12", ARRAYS, {"count": 4})
+    assert store.info("extract", "ab12") == {"count": 4}
 
 
 def test_nothing_half_written_stays(tmp_path):

@@ -86,6 +86,16 @@ def test_the_track_stays_where_navigation_has_it_and_says_how_sure_that_is():
     assert (found.sigma_tilt_rad < np.radians(0.3)).all()
 
 
+def test_the_stated_tilt_does_not_depend_on_how_many_images_there_are():
+    sigmas = []
+    for lines in (2, 8):
+        poses = _survey(lines=lines)
+        navigation = _navigation(poses, np.random.default_rng(0))
+        sigmas.append(np.degrees(_run(poses, [], navigation).sigma_tilt_rad).mean())
+    assert 0.3 < sigmas[0] < 0.45
+    assert abs(sigmas[1] / sigmas[0] - 1) < 0.1
+
+
 def test_wrong_links_are_found_out():
     rng, poses = np.random.default_rng(2), _survey()
     links = _links(poses, rng)

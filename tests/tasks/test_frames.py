@@ -2,6 +2,7 @@ import pickle
 
 import numpy as np
 import pyproj
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from seamosaic.tasks.frames import MapFrame
@@ -23,6 +24,15 @@ def test_true_north_is_not_grid_north():
     factors = pyproj.Proj("EPSG:32632").get_factors(6.0127, 43.0421)
     assert abs(convergence + factors.meridian_convergence) < 1e-3
     assert abs(np.hypot(north[0], north[1]) / 10 - factors.meridional_scale) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("code", "latitude", "longitude"), [(27700, 50.1, -5.0), (23031, 43.0, 3.1), (27572, 47.0, 2.5)]
+)
+def test_maps_of_another_datum_than_navigations(code, latitude, longitude):
+    frame = MapFrame(pyproj.CRS(f"EPSG:{code}").to_wkt(), latitude, longitude)
+    expected = pyproj.Transformer.from_crs(4326, code, always_xy=True).transform(longitude, latitude)
+    np.testing.assert_allclose(frame.map_from_local(np.zeros((1, 3)))[0, :2], expected, atol=1e-3)
 
 
 def test_rotation_to_the_map_turns_by_the_convergence():
