@@ -38,6 +38,9 @@ def match_batch(job: Job, batch: Sequence[PairTask], extracted: Mapping[int, Don
     loaded: dict[int, Entry] = {}
     found = []
     for pair in batch:
+        if any(extracted[row].info["status"] for row in (pair.i, pair.j)):
+            found.append((pair.i, pair.j, Done(STEP, "", False, 0.0, {"model": "", "matches": 0, "inliers": 0})))
+            continue
         for row in (pair.i, pair.j):
             if row not in loaded:
                 loaded[row] = load(job, extract.STEP, extracted[row].key)

@@ -83,7 +83,8 @@ def test_the_track_stays_where_navigation_has_it_and_says_how_sure_that_is():
     assert np.abs(shift).max() < 0.05
     assert (np.abs(found.sigma_m[:, :2] / 0.4 - 1) < 0.1).all()
     assert (found.sigma_m[:, 2] < 0.02).all()
-    assert (found.sigma_tilt_rad < np.radians(0.3)).all()
+    tilt = np.degrees(found.sigma_tilt_rad)  # the bias of the sensor stays, the noise averages down
+    assert ((tilt > 0.3) & (tilt < 0.35)).all()
 
 
 def test_the_stated_tilt_does_not_depend_on_how_many_images_there_are():

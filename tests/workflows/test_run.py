@@ -139,7 +139,7 @@ def test_small_tiles_many_of_them_empty_give_the_same_maps(reef, tmp_path):
 
 def test_an_image_without_a_time_is_a_row_of_its_own(spoilt, tmp_path):
     mission, image = spoilt
-    image.rename(image.with_name("untimed.jpg"))
+    image.rename(image.with_name("V_untimed.jpg"))
     result = run(str(mission), tmp_path / "out", Parameters(), scheduler="sync")
     assert result.quality.pairs.linked > 3
     assert result.quality.trajectory.rejected == 1
