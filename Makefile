@@ -6,6 +6,8 @@
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
+# the certificates of the machine, not uv's own; pip takes over where uv cannot reach the index
+INSTALL := $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python
 
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/matplotlib
 
@@ -16,8 +18,8 @@ setup: $(VENV)/.ready
 $(VENV)/.ready: requirements.lock requirements-uv.lock pyproject.toml
 	$(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-uv.lock
-	$(BIN)/uv pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock
-	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable .
+	$(INSTALL) --require-hashes -r requirements.lock || $(BIN)/pip install --quiet --require-hashes -r requirements.lock
+	$(INSTALL) --no-deps --no-build-isolation --editable .
 	touch $@
 
 demo: setup

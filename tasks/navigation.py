@@ -11,6 +11,8 @@ from .rotations import R_LOCAL_LEVEL, R_level_vehicle, R_vehicle_camera
 
 Array = NDArray[Any]
 
+_JITTER = 0.1
+
 
 class Poses(NamedTuple):
     """Cameras in the local frame.
@@ -109,7 +111,11 @@ def relative(navigation: NavigationPrior, i: int, j: int) -> RelativePrior:
 
 
 def walk_m(navigation: NavigationPrior, i: int, j: int) -> float:
-    """1-sigma along either horizontal axis of navigation's step between two images, metres."""
+    """1-sigma along either horizontal axis of navigation's step between two images, metres.
+
+    Dead reckoning walks; each position jitters besides, by a share of its stated sigma, which is what a satellite or
+    acoustic fix does most. Never more than the stated sigmas say.
+    """
     elapsed = abs(float(navigation.time_s[j] - navigation.time_s[i]))
     stated = np.hypot(navigation.sigma_horizontal[i], navigation.sigma_horizontal[j])
-    return float(min(navigation.drift_m_per_sqrt_s * np.sqrt(elapsed), stated))
+    return float(min(np.hypot(navigation.drift_m_per_sqrt_s * np.sqrt(elapsed), _JITTER * stated), stated))

@@ -124,8 +124,10 @@ def test_images_without_links_keep_navigation_and_say_so():
 
 def test_without_laser_navigation_gives_the_scale():
     rng, poses = np.random.default_rng(4), _survey()
-    found = _run(poses, _links(poses, rng, metric=False), _navigation(poses, rng))
-    assert 0.001 < _rigid_rms(found.poses.C_local, poses.C_local) < 0.06
+    navigation = _navigation(poses, rng)
+    found = _run(poses, _links(poses, rng, metric=False), navigation)
+    before, after = (_rigid_rms(p.C_local, poses.C_local) for p in (navigation.poses, found.poses))
+    assert 0.001 < after < 0.7 * before
 
 
 def test_without_navigation_motions_are_chained_from_the_first_image():

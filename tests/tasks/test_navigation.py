@@ -49,7 +49,7 @@ def test_relative_uncertainty_walks_and_is_bounded_by_the_absolute():
     near, far = (navigation.relative(_prior([0, seconds]), 0, 1) for seconds in (4, 1e6))
     sigma_near, sigma_far = (np.sqrt(motion.covariance[3, 3]) for motion in (near, far))
     turned = np.radians(0.84)
-    assert abs(sigma_near**2 - (0.04**2 + turned**2 + 1e-6)) < 1e-9
+    assert abs(sigma_near**2 - (0.04**2 + 2 * 0.04**2 + turned**2 + 1e-6)) < 1e-9
     assert abs(sigma_far**2 - (2 * 0.4**2 + turned**2 + 1e-6)) < 1e-6
     np.testing.assert_allclose(near.t_i_j, [1, 0, 0], atol=1e-12)
     # heading is the rotation about the optical axis
