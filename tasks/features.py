@@ -37,19 +37,19 @@ def detect(grey: NDArray[np.uint8], ignore: NDArray[np.bool_], parameters: Featu
         grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
         halvings += 1
     mask = cv2.resize((~ignore).astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    # descriptors cost most: half as many again as are kept, to choose from
-    most = parameters.max_features * 3 // 2
-    sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=parameters.contrast_threshold)
-    keypoints, descriptors = sift.detectAndCompute(grey, mask)
-    if not keypoints:
+    sift = cv2.SIFT_create(contrastThreshold=parameters.contrast_threshold)
+    found = sift.detect(grey, mask)
+    if not found:
         return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 128), np.uint8))
+    places, response = np.array([k.pt for k in found], np.float32), np.array([k.response for k in found])
+    # descriptors cost most: only of those that are kept
+    keep = _strongest_everywhere(places, response, grey.shape, parameters.max_features)
+    keypoints, descriptors = sift.compute(grey, [found[k] for k in keep])
     uv = np.array([k.pt for k in keypoints], np.float32)
-    response = np.array([k.response for k in keypoints])
-    keep = _strongest_everywhere(uv, response, grey.shape, parameters.max_features)
     # pixel centres at integers: the centre of a halved pixel lies between two full ones
-    full = (uv[keep] + 0.5) * 2**halvings - 0.5
-    scale = np.array([keypoints[k].size for k in keep], np.float32) * 2**halvings
-    return Features(full.astype(np.float32), scale, descriptors[keep].astype(np.uint8))
+    full = (uv + 0.5) * 2**halvings - 0.5
+    scale = np.array([k.size for k in keypoints], np.float32) * 2**halvings
+    return Features(full.astype(np.float32), scale, descriptors.astype(np.uint8))
 
 
 def _strongest_everywhere(uv: NDArray, response: NDArray, shape: tuple[int, ...], count: int) -> NDArray[np.intp]:

@@ -131,16 +131,21 @@ class _Start(NamedTuple):
 def _starts(
     x_i: Array, x_j: Array, focal_px: float, parameters: MatchParameters, prior: RelativePrior | None
 ) -> list[_Start]:
-    """Where to begin: with the essential matrix, or with navigation where the two disagree.
+    """Where to begin: with the essential matrix if navigation agrees to it.
 
-    Without navigation nothing tells whether the essential matrix fell for the plane that most points lie on; the
-    decompositions of their homography are tried as well.
+    Else it may have fallen for the plane that most points lie on, so the decompositions of their homography are
+    tried as well; where navigation agrees to none of them, its own motion is the start.
     """
-    start = _from_essential(x_i, x_j, focal_px, parameters)
-    if prior is not None and start is not None and not _compatible(start, prior):
-        start = _from_prior(x_i, x_j, prior, focal_px, parameters)
-    others = [] if prior is not None else _from_unknown_plane(x_i, x_j, focal_px, parameters)
-    return [begin for begin in (start, *others) if begin is not None]
+    essential = _from_essential(x_i, x_j, focal_px, parameters)
+    if essential is not None and prior is not None and _compatible(essential, prior):
+        return [essential]
+    starts = [] if essential is None else [essential]
+    starts += _from_unknown_plane(x_i, x_j, focal_px, parameters)
+    if prior is None:
+        return starts
+    believable = [start for start in starts if _compatible(start, prior)]
+    given = None if believable else _from_prior(x_i, x_j, prior, focal_px, parameters)
+    return believable if given is None else [given]
 
 
 def _from_unknown_plane(x_i: Array, x_j: Array, focal_px: float, parameters: MatchParameters) -> list[_Start]:
