@@ -17,12 +17,10 @@ class Features(NamedTuple):
     Attributes
     ----------
     uv : (N, 2) float32 pixels at full resolution.
-    scale_px : (N,) float32 diameter of the neighbourhood, pixels at full resolution.
     descriptors : (N, 128) uint8 SIFT.
     """
 
     uv: NDArray[np.float32]
-    scale_px: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
 
 
@@ -40,7 +38,7 @@ def detect(grey: NDArray[np.uint8], ignore: NDArray[np.bool_], parameters: Featu
     sift = cv2.SIFT_create(contrastThreshold=parameters.contrast_threshold)
     found = sift.detect(grey, mask)
     if not found:
-        return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 128), np.uint8))
+        return Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))
     places, response = np.array([k.pt for k in found], np.float32), np.array([k.response for k in found])
     # descriptors cost most: only of those that are kept
     keep = _strongest_everywhere(places, response, grey.shape, parameters.max_features)
@@ -48,8 +46,7 @@ def detect(grey: NDArray[np.uint8], ignore: NDArray[np.bool_], parameters: Featu
     uv = np.array([k.pt for k in keypoints], np.float32)
     # pixel centres at integers: the centre of a halved pixel lies between two full ones
     full = (uv + 0.5) * 2**halvings - 0.5
-    scale = np.array([k.size for k in keypoints], np.float32) * 2**halvings
-    return Features(full.astype(np.float32), scale, descriptors.astype(np.uint8))
+    return Features(full.astype(np.float32), descriptors.astype(np.uint8))
 
 
 def _strongest_everywhere(uv: NDArray, response: NDArray, shape: tuple[int, ...], count: int) -> NDArray[np.intp]:
