@@ -1,9 +1,9 @@
 """All poses from pair motions and navigation in one estimate (paper IV and its outlook), solved by GTSAM.
 
 Navigation's errors are modelled as they are: roll, pitch and depth as independent noise, heading as a bias of the
-whole track, horizontal position as one offset (sigma_horizontal) plus a random walk from image to image. Pair motions enter
-as relative poses with their covariance under a robust kernel. Without navigation the first image is the datum and the motions
-are chained from it (paper IV).
+whole track, horizontal position as one offset (sigma_horizontal) plus a random walk from image to image. Pair motions
+enter as relative poses with their covariance under a robust kernel. Without navigation the first image is the datum
+and the motions are chained from it (paper IV).
 """
 
 import itertools
