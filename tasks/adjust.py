@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 
 from ..schemas.parameters import AdjustParameters
 from .motion import Motion
-from .navigation import NavigationPrior, Poses, relative, walk_m
+from .navigation import NavigationPrior, Poses, relative, walk_m, with_half_turns
 
 Array = NDArray[Any]
 Status = Literal["adjusted", "navigation", "rejected: no link to the first image"]
@@ -30,11 +30,12 @@ _LINK_FLOOR = np.diag([np.radians(0.01)] * 3 + [1e-3] * 3) ** 2
 
 
 class Link(NamedTuple):
-    """The motion between images i < j."""
+    """The motion between images i < j; whether either lies the other way round than navigation has it."""
 
     i: int
     j: int
     motion: Motion
+    turned: tuple[bool, bool] = (False, False)
 
 
 class Adjusted(NamedTuple):
@@ -47,6 +48,7 @@ class Adjusted(NamedTuple):
     sigma_tilt_rad : (n,) 1-sigma of the angle by which the optical axis may lean, about either image axis.
     status : per image.
     used : (links,) bool, False for links that contradict navigation or each other.
+    turned : (n,) bool, images whose pixels lie the other way round than navigation has them.
     """
 
     poses: Poses
@@ -54,6 +56,7 @@ class Adjusted(NamedTuple):
     sigma_tilt_rad: Array
     status: list[Status]
     used: NDArray[np.bool_]
+    turned: NDArray[np.bool_]
 
 
 def adjust(
@@ -64,7 +67,9 @@ def adjust(
     links must be metric where there is no navigation; with navigation those that are not are scaled by it.
     R_first : R_local_camera (3, 3) of the first image, used without navigation only.
     """
+    turned = _half_turns(count, links)
     if navigation is not None:
+        navigation = with_half_turns(navigation, turned)
         links = [_scaled_by_navigation(link, navigation) for link in links]
     plausible = np.array([_plausible(link, navigation) for link in links], bool)
     usable = [link for link, ok in zip(links, plausible, strict=True) if ok]
@@ -87,7 +92,17 @@ def adjust(
         sigma_tilt_rad=sigma_tilt,
         status=_status(usable, poses, navigation),
         used=np.array([(link.i, link.j) in kept for link in links], bool),
+        turned=turned,
     )
+
+
+def _half_turns(count: int, links: list[Link]) -> NDArray[np.bool_]:
+    """Images (n,) of which most matches say that they lie the other way round than navigation has them."""
+    votes = np.zeros(count)
+    for link in links:
+        weight = len(link.motion.inliers)
+        votes[[link.i, link.j]] += [weight if turned else -weight for turned in link.turned]
+    return votes > 0
 
 
 def _plausible(link: Link, navigation: NavigationPrior | None) -> bool:

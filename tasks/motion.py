@@ -97,8 +97,12 @@ def estimate(
     focal_px: float,
     parameters: MatchParameters,
     prior: RelativePrior | None = None,
+    laser_sigma: float = 0.0,
 ) -> Motion | None:
     """Motion from matches (N, 2) in slopes and the soundings (L, 3) of both images in their camera frames.
+
+    laser_sigma is the share of their range by which all soundings of an image may be wrong together, as they are
+    where navigation carried them over from another image.
 
     Where images share a narrow strip only, rotation and translation can hardly be told apart: navigation's motion,
     if given as prior, then leads to the right solution, but does not count in its covariance. None when fewer than
@@ -109,9 +113,9 @@ def estimate(
     plane = common_plane(laser_i, laser_j, parameters)
     start = None if plane is None else _from_homography(x_i, x_j, plane, focal_px, parameters)
     if start is not None and plane is not None:
-        return _refine_on_plane(x_i, x_j, start, plane, focal_px, parameters)
+        return _refine_on_plane(x_i, x_j, start, plane, focal_px, parameters, laser_sigma)
     found = [
-        _refine_epipolar(x_i, x_j, start, laser_i, laser_j, focal_px, parameters, prior)
+        _refine_epipolar(x_i, x_j, start, laser_i, laser_j, focal_px, parameters, prior, laser_sigma)
         for start in _starts(x_i, x_j, focal_px, parameters, prior)
     ]
     return max((motion for motion in found if motion is not None), key=_credit, default=None)
@@ -226,7 +230,13 @@ def _thin(inliers: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _refine_on_plane(
-    x_i: Array, x_j: Array, start: _Start, plane: Plane, focal_px: float, parameters: MatchParameters
+    x_i: Array,
+    x_j: Array,
+    start: _Start,
+    plane: Plane,
+    focal_px: float,
+    parameters: MatchParameters,
+    laser_sigma: float,
 ) -> Motion | None:
     """Least squares of the transfer over the laser's plane; relief about the plane counts as noise of the match."""
     relief_px = plane.rms_m / plane.offset**2 * np.linalg.norm(start.t_i_j) * focal_px
@@ -247,7 +257,7 @@ def _refine_on_plane(
     if len(inliers) < parameters.min_inliers:
         return None
     # The plane's own offset scales the translation: its error adds along it.
-    scale_sigma = plane.rms_m / plane.offset / 3
+    scale_sigma = float(np.hypot(plane.rms_m / plane.offset / 3, laser_sigma))
     along = R.T @ t * scale_sigma
     covariance = _covariance(solution.jac, solution.fun)
     covariance[3:, 3:] += np.outer(along, along)
@@ -263,6 +273,7 @@ def _refine_epipolar(
     focal_px: float,
     parameters: MatchParameters,
     prior: RelativePrior | None,
+    laser_sigma: float,
 ) -> Motion | None:
     """Least squares of the Sampson distance for direction and rotation, with the laser's scale."""
     R, t, inliers = start.R_i_j, start.t_i_j, start.inliers
@@ -282,6 +293,7 @@ def _refine_epipolar(
     metric = bool(np.isfinite(scale))
     if metric and spread > _LASER_CONTRADICTS:
         return None
+    scale_sigma = float(np.hypot(scale_sigma, laser_sigma))
     covariance = _epipolar_covariance(solution, scale_sigma if metric else _UNIT_LENGTH_SIGMA, prior is not None)
     if metric:
         t = t * scale

@@ -110,6 +110,27 @@ def relative(navigation: NavigationPrior, i: int, j: int) -> RelativePrior:
     return RelativePrior(R_i.T @ R_j, R_i.T @ step, covariance)
 
 
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+
+
+def with_half_turns(navigation: NavigationPrior, turned: NDArray[np.bool_]) -> NavigationPrior:
+    """Navigation with the cameras of the images `turned` (n,) turned by half a circle about their optical axes.
+
+    Picture viewers turn photographs, and some vehicles fly a line with the camera looking backwards: then pixels lie
+    the other way round than mount and heading say.
+    """
+    R = navigation.poses.R_local_camera.copy()
+    R[turned] = R[turned] @ _HALF_TURN
+    return navigation._replace(poses=navigation.poses._replace(R_local_camera=R))
+
+
+def with_half_turn(prior: RelativePrior, i: bool, j: bool) -> RelativePrior:
+    """A motion with the camera of image i, of image j or of both turned by half a circle about its optical axis."""
+    D_i, D_j = (_HALF_TURN if turned else np.eye(3) for turned in (i, j))
+    both = np.kron(np.eye(2), D_j)
+    return RelativePrior(D_i @ prior.R_i_j @ D_j, D_i @ prior.t_i_j, both @ prior.covariance @ both)
+
+
 def walk_m(navigation: NavigationPrior, i: int, j: int) -> float:
     """1-sigma along either horizontal axis of navigation's step between two images, metres.
 

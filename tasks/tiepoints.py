@@ -17,6 +17,7 @@ _MAX_GAP_PX = 4.0
 _NEIGHBOURS = 8
 _STEEPEST = 1.5  # rise over run between a point and its neighbours
 _MIN_PARALLAX = 0.02  # radians; below it depth is little more than a guess
+_WORST_SIGMA = 0.05  # of the range: what is less certain says nothing that its surroundings do not
 
 
 class TiePoints(NamedTuple):
@@ -59,6 +60,8 @@ def triangulate(
         sigma_m=distance * angle_sigma / parallax,
         common_sigma_m=np.hypot(distance * turn, shift) / parallax,
     )
+    certain = np.hypot(found.sigma_m, found.common_sigma_m) < _WORST_SIGMA * distance
+    found = TiePoints(*(values[certain] for values in found))
     return TiePoints(*(values[_like_neighbours(found)] for values in found))
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from ..catalog.store import Entry
 from ..tasks import camera, features, motion, pairs
-from ..tasks.navigation import Poses, RelativePrior
+from ..tasks.adjust import Link
+from ..tasks.navigation import Poses, RelativePrior, with_half_turn
 from . import extract
 from .job import Done, Job, Made, array_digest, code_version, load, once, stage
 
@@ -17,11 +18,18 @@ STEP = "match"
 VERSION = code_version(sys.modules[__name__])
 
 
+class Lit(NamedTuple):
+    """A laser image taken beside a texture image: its row and its camera's pose in the texture image's camera."""
+
+    row: int
+    step: RelativePrior
+
+
 class PairTask(NamedTuple):
     """Two images to match, i < j, rows of the frames table; their poses so far, if any.
 
     poses : of these two images. range_m : height above the seabed where the laser does not tell.
-    margin_m : how far the relative position may be wrong.
+    margin_m : how far the relative position may be wrong. lit_i, lit_j : laser images that sound for either.
     """
 
     i: int
@@ -30,6 +38,18 @@ class PairTask(NamedTuple):
     prior: RelativePrior | None
     range_m: float
     margin_m: float
+    lit_i: tuple[Lit, ...] = ()
+    lit_j: tuple[Lit, ...] = ()
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """Every image whose extraction the pair needs."""
+        return (self.i, self.j, *(lit.row for lit in (*self.lit_i, *self.lit_j)))
+
+
+Carried = tuple[tuple[Entry, RelativePrior], ...]
+Soundings = tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]
+_HALF_TURNS = (True, True), (False, True), (True, False)
 
 
 def match_batch(job: Job, batch: Sequence[PairTask], extracted: Mapping[int, Done]) -> list[tuple[int, int, Done]]:
@@ -41,83 +61,158 @@ def match_batch(job: Job, batch: Sequence[PairTask], extracted: Mapping[int, Don
         if any(extracted[row].info["status"] for row in (pair.i, pair.j)):
             found.append((pair.i, pair.j, Done(STEP, "", False, 0.0, {"model": "", "matches": 0, "inliers": 0})))
             continue
-        for row in (pair.i, pair.j):
+        pair = _readable(pair, extracted)
+        for row in pair.rows:
             if row not in loaded:
                 loaded[row] = load(job, extract.STEP, extracted[row].key)
-        keys = extracted[pair.i].key, extracted[pair.j].key
-        found.append((pair.i, pair.j, _match(job, pair, keys, loaded[pair.i], loaded[pair.j])))
-        loaded = {row: entry for row, entry in loaded.items() if row >= pair.i}
+        keys = [extracted[row].key for row in pair.rows]
+        found.append((pair.i, pair.j, _match(job, pair, keys, loaded)))
+        loaded = {row: entry for row, entry in loaded.items() if row >= min(pair.rows)}
     return found
 
 
-def _match(job: Job, pair: PairTask, keys: tuple[str, str], a: Entry, b: Entry) -> Done:
+def _readable(pair: PairTask, extracted: Mapping[int, Done]) -> PairTask:
+    """The pair without laser images that could not be read."""
+    lit_i, lit_j = (
+        tuple(lit for lit in side if lit.row in extracted and not extracted[lit.row].info["status"])
+        for side in (pair.lit_i, pair.lit_j)
+    )
+    return pair._replace(lit_i=lit_i, lit_j=lit_j)
+
+
+def _match(job: Job, pair: PairTask, keys: Sequence[str], loaded: Mapping[int, Entry]) -> Done:
     known = [] if pair.poses is None else [array_digest(*pair.poses)]
-    known += [] if pair.prior is None else [array_digest(*pair.prior)]
+    known += [array_digest(*step) for step in (pair.prior, *(lit.step for lit in (*pair.lit_i, *pair.lit_j))) if step]
     parameters = [
         *stage(job.calibration.camera, job.parameters.match),
         round(pair.range_m, 6),
         round(pair.margin_m, 6),
+        len(pair.lit_i),
     ]
-    return once(job, STEP, VERSION, [*keys, *known], parameters, lambda: _motion(job, pair, a, b))
+
+    def make() -> Made:
+        lit_i, lit_j = (tuple((loaded[lit.row], lit.step) for lit in side) for side in (pair.lit_i, pair.lit_j))
+        return _motion(job, pair, loaded[pair.i], loaded[pair.j], (lit_i, lit_j))
+
+    return once(job, STEP, VERSION, [*keys, *known], parameters, make)
 
 
-def _motion(job: Job, pair: PairTask, a: Entry, b: Entry) -> Made:
-    lens, p = job.calibration.camera, job.parameters.match
+def _motion(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried, Carried]) -> Made:
     if "feature_uv" not in a.arrays or "feature_uv" not in b.arrays:
         return Made({}, {"model": "", "matches": 0, "inliers": 0})
     ranges = [range_m for range_m in (a.info["range_m"], b.info["range_m"]) if range_m]
     at = float(np.mean(ranges)) if ranges else pair.range_m
-    index_a, index_b = _candidates(job, pair, a, b, at)
-    matches = features.match(
-        a.arrays["feature_descriptors"][index_a], b.arrays["feature_descriptors"][index_b], p.ratio
-    )
-    uv_a = a.arrays["feature_uv"][index_a[matches[:, 0]]].astype(float)
-    uv_b = b.arrays["feature_uv"][index_b[matches[:, 1]]].astype(float)
-    found = motion.estimate(
-        camera.normalised(lens, uv_a, at),
-        camera.normalised(lens, uv_b, at),
-        a.arrays.get("laser_X", np.zeros((0, 3))),
-        b.arrays.get("laser_X", np.zeros((0, 3))),
-        at / camera.ground_sample_distance(lens, at),
-        p,
-        pair.prior,
-    )
+    everything = tuple(np.arange(len(entry.arrays["feature_uv"])) for entry in (a, b))
+    near = everything if pair.poses is None else _candidates(job, pair, pair.poses, a, b, at)
+    matched = _matches(job, a, b, near)
+    soundings = _soundings(a, carried[0]), _soundings(b, carried[1])
+    found, turned = _estimate(job, pair.prior, *matched, soundings, at), (False, False)
+    if pair.prior is not None and _weak(found, matched):
+        found, matched, turned = _with_half_turns(job, pair.prior, a, b, (found, matched), soundings, at)
+    count = len(matched[0])
     if found is None:
-        return Made({}, {"model": "", "matches": len(matches), "inliers": 0})
+        return Made({}, {"model": "", "matches": count, "inliers": 0})
     return Made(
         {
             "R": found.R_i_j,
             "t": found.t_i_j,
             "covariance": found.covariance,
-            "uv_i": uv_a[found.inliers].astype(np.float32),
-            "uv_j": uv_b[found.inliers].astype(np.float32),
+            "uv_i": matched[0][found.inliers].astype(np.float32),
+            "uv_j": matched[1][found.inliers].astype(np.float32),
         },
         {
             "model": found.model,
             "metric": found.metric,
             "scale_sigma": found.scale_sigma if found.metric else None,
-            "matches": len(matches),
+            "matches": count,
             "inliers": len(found.inliers),
+            "turned": list(turned),
         },
     )
 
 
-def _candidates(job: Job, pair: PairTask, a: Entry, b: Entry, range_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Features that the other image may see too: all of them where no poses are known."""
-    counts = len(a.arrays["feature_uv"]), len(b.arrays["feature_uv"])
-    if pair.poses is None:
-        return np.arange(counts[0]), np.arange(counts[1])
+Matched = tuple[np.ndarray, np.ndarray]
+
+
+def _matches(job: Job, a: Entry, b: Entry, index: tuple[np.ndarray, ...]) -> Matched:
+    """Pixels (M, 2), (M, 2) of matched features, of those that index names in either image."""
+    of_a, of_b = (entry.arrays["feature_descriptors"][chosen] for entry, chosen in zip((a, b), index, strict=True))
+    matches = features.match(of_a, of_b, job.parameters.match.ratio)
+    uv_a, uv_b = (
+        entry.arrays["feature_uv"][chosen[column]].astype(float)
+        for entry, chosen, column in zip((a, b), index, matches.T, strict=True)
+    )
+    return uv_a, uv_b
+
+
+def _estimate(
+    job: Job, prior: RelativePrior | None, uv_a: np.ndarray, uv_b: np.ndarray, soundings: Soundings, range_m: float
+) -> motion.Motion | None:
+    lens = job.calibration.camera
+    focal_px = range_m / camera.ground_sample_distance(lens, range_m)
+    slopes = camera.normalised(lens, uv_a, range_m), camera.normalised(lens, uv_b, range_m)
+    (X_a, sigma_a), (X_b, sigma_b) = soundings
+    shared = max(sigma_a, sigma_b) / range_m
+    return motion.estimate(*slopes, X_a, X_b, focal_px, job.parameters.match, prior, shared)
+
+
+def _weak(found: motion.Motion | None, matched: Matched) -> bool:
+    """Whether most matches disagree with what navigation lets them say."""
+    return found is None or len(found.inliers) < 0.5 * len(matched[0])
+
+
+def _with_half_turns(
+    job: Job,
+    prior: RelativePrior,
+    a: Entry,
+    b: Entry,
+    so_far: tuple[motion.Motion | None, Matched],
+    soundings: Soundings,
+    range_m: float,
+) -> tuple[motion.Motion | None, Matched, tuple[bool, bool]]:
+    """What matches say when either image, or both, may lie the other way round than navigation has it.
+
+    Believed only when twice as many matches agree to it, and twice as many as make a pair.
+    """
+    best, matched = so_far
+    uv = _matches(job, a, b, tuple(np.arange(len(entry.arrays["feature_uv"])) for entry in (a, b)))
+    needed = 2 * max(len(best.inliers) if best else 0, job.parameters.match.min_inliers)
+    found = best, matched, (False, False)
+    if len(uv[0]) < needed:
+        return found
+    for turned in _HALF_TURNS:
+        other = _estimate(job, with_half_turn(prior, *turned), *uv, soundings, range_m)
+        if other is not None and len(other.inliers) > needed:
+            needed, found = len(other.inliers), (other, uv, turned)
+    return found
+
+
+def _soundings(entry: Entry, carried: Carried) -> tuple[np.ndarray, float]:
+    """Soundings (L, 3) in the frame of an image, and the sigma, metres, that they share.
+
+    An image without a laser has those of the laser images taken just before and after, carried over by navigation.
+    """
+    own = entry.arrays.get("laser_X", np.zeros((0, 3)))
+    if len(own) or not carried:
+        return own, 0.0
+    parts = [lit.arrays.get("laser_X", np.zeros((0, 3))) @ step.R_i_j.T + step.t_i_j for lit, step in carried]
+    variance = [float(step.covariance[3:, 3:].trace()) / 3 for _, step in carried]
+    return np.concatenate(parts), float(np.sqrt(np.mean(variance)))
+
+
+def _candidates(job: Job, pair: PairTask, poses: Poses, a: Entry, b: Entry, range_m: float):
+    """Features that the other image may see too."""
     lens = job.calibration.camera
     seen = [
-        pairs.seen_by(lens, entry.arrays["feature_uv"].astype(float), pair.poses, k, 1 - k, range_m, pair.margin_m)
+        pairs.seen_by(lens, entry.arrays["feature_uv"].astype(float), poses, k, 1 - k, range_m, pair.margin_m)
         for k, entry in enumerate((a, b))
     ]
     return np.flatnonzero(seen[0]), np.flatnonzero(seen[1])
 
 
-def link_motion(entry: Entry) -> motion.Motion:
-    """A stored motion."""
-    return motion.Motion(
+def link(i: int, j: int, entry: Entry) -> Link:
+    """A stored motion as the adjustment takes it."""
+    found = motion.Motion(
         R_i_j=entry.arrays["R"],
         t_i_j=entry.arrays["t"],
         covariance=entry.arrays["covariance"],
@@ -126,3 +221,5 @@ def link_motion(entry: Entry) -> motion.Motion:
         metric=entry.info["metric"],
         scale_sigma=entry.info["scale_sigma"] if entry.info["metric"] else float("nan"),
     )
+    turned_i, turned_j = entry.info["turned"]
+    return Link(i, j, found, (turned_i, turned_j))

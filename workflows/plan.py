@@ -12,12 +12,14 @@ from ..tasks import navigation, pairs, rotations
 from ..tasks.frames import MapFrame
 from ..tasks.navigation import NavigationPrior, Poses
 from .extract import ImageTask
-from .match import PairTask
+from .match import Lit, PairTask
 
 # Height above the seabed that is assumed where neither altimeter nor laser tells (paper V: 3 m)
 ASSUMED_RANGE_M = 3.0
 _SEQUENTIAL_REACH = 3
 _BRIDGE_REACH = 16
+# A laser image taken within this of a texture image sounds for it, seconds
+_LIT_WITHIN_S = 10.0
 
 
 class Plan(NamedTuple):
@@ -100,12 +102,33 @@ def first_pairs(made: Plan, opened: OpenedMission, parameters: Parameters) -> li
     margin = _margin(made.prior)
     outlines = pairs.footprints(opened.calibration.camera, made.prior.poses, made.range_m)
     found = overlapping(outlines, rows, margin, parameters)
+    lit = _lit(made)
     tasks = []
     for i, j in found:
         prior = navigation.relative(made.prior, i, j)
         spread = 2 * float(np.sqrt(prior.covariance[3:, 3:].trace())) + 0.05 * made.range_m[i]
-        tasks.append(PairTask(i, j, _two(made.prior.poses, i, j), prior, float(made.range_m[i]), spread))
+        poses = _two(made.prior.poses, i, j)
+        tasks.append(PairTask(i, j, poses, prior, float(made.range_m[i]), spread, lit.get(i, ()), lit.get(j, ())))
     return tasks
+
+
+def _lit(made: Plan) -> dict[int, tuple[Lit, ...]]:
+    """Of each texture image the laser images taken just before and just after, with navigation's step to them."""
+    assert made.prior is not None
+    time, known = made.prior.time_s, made.prior.poses.known
+    lasers = np.array([image.row for image in made.images if image.role == "laser" and known[image.row]], int)
+    found = {}
+    for image in made.images:
+        if image.role != "texture" or not known[image.row]:
+            continue
+        after = int(np.searchsorted(lasers, image.row))
+        beside = [row for row in lasers[max(0, after - 1) : after + 1].tolist() if _soon(time, image.row, row)]
+        found[image.row] = tuple(Lit(row, navigation.relative(made.prior, image.row, row)) for row in beside)
+    return found
+
+
+def _soon(time_s: np.ndarray, a: int, b: int) -> bool:
+    return abs(float(time_s[a] - time_s[b])) <= _LIT_WITHIN_S
 
 
 def more_pairs(

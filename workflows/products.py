@@ -374,6 +374,13 @@ def _doubts(rows: Sequence[trajectories.Row], results: Results) -> Iterator[str]
     alone = sum(row.kind == "navigation" for row in rows)
     if alone:
         yield f"{alone} of {len(rows)} images are placed by navigation alone: no match with another image holds them"
+    turned = [rows[k].image for k in np.flatnonzero(results.posed.solution.turned).tolist()]
+    if turned:
+        names = ", ".join(turned[:6]) + (" ..." if len(turned) > 6 else "")
+        yield (
+            f"{len(turned)} of {len(rows)} images lie the other way round than mount and heading say, by their matches "
+            f"with others, and were placed so (turned by a picture viewer? flown backwards?): {names}"
+        )
     if results.posed.matched and not len(results.posed.solution.pairs):
         yield f"none of {len(results.posed.matched)} pairs of images could be linked"
 

@@ -150,7 +150,7 @@ def _match_tasks(
 ) -> list[Delayed]:
     tasks = []
     for k, batch in enumerate(plan.batches(wanted, _PAIRS_A_BATCH)):
-        rows = {row for pair in batch for row in (pair.i, pair.j)}
+        rows = {row for pair in batch for row in pair.rows if row in batch_of}
         needed = sorted({batch_of[row] for row in rows})
         first_rows = [
             [i.row for i in state.plan.images[n * _IMAGES_A_BATCH : (n + 1) * _IMAGES_A_BATCH]] for n in needed

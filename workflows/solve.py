@@ -8,7 +8,6 @@ import numpy as np
 
 from ..catalog.store import Entry
 from ..tasks import adjust
-from ..tasks.adjust import Link
 from ..tasks.navigation import NavigationPrior, Poses
 from . import match
 from .job import Done, Job, Made, array_digest, code_version, load, once, stage
@@ -22,7 +21,7 @@ class Solution(NamedTuple):
 
     Attributes
     ----------
-    poses, sigma_m, sigma_tilt_rad, status : see `tasks.adjust.Adjusted`.
+    poses, sigma_m, sigma_tilt_rad, status, turned : see `tasks.adjust.Adjusted`.
     pairs : (P, 2) rows of the linked pairs that were used.
     """
 
@@ -31,6 +30,7 @@ class Solution(NamedTuple):
     sigma_tilt_rad: np.ndarray
     status: list[str]
     pairs: np.ndarray
+    turned: np.ndarray
 
 
 def adjust_all(
@@ -45,7 +45,7 @@ def adjust_all(
     inputs.append(array_digest(R_first))
 
     def make() -> Made:
-        links = [Link(i, j, match.link_motion(load(job, match.STEP, done.key))) for i, j, done in linked]
+        links = [match.link(i, j, load(job, match.STEP, done.key)) for i, j, done in linked]
         found = adjust.adjust(count, links, prior, R_first, job.parameters.adjust)
         used = np.array([[link.i, link.j] for link, ok in zip(links, found.used, strict=True) if ok], int)
         arrays = {
@@ -54,6 +54,7 @@ def adjust_all(
             "sigma_m": found.sigma_m,
             "sigma_tilt_rad": found.sigma_tilt_rad,
             "pairs": used.reshape(-1, 2),
+            "turned": found.turned,
         }
         return Made(arrays, {"status": found.status})
 
@@ -64,4 +65,5 @@ def solution(entry: Entry) -> Solution:
     """The stored adjustment."""
     arrays = entry.arrays
     poses = Poses(arrays["R"], arrays["C"])
-    return Solution(poses, arrays["sigma_m"], arrays["sigma_tilt_rad"], entry.info["status"], arrays["pairs"])
+    status, turned = entry.info["status"], arrays["turned"]
+    return Solution(poses, arrays["sigma_m"], arrays["sigma_tilt_rad"], status, arrays["pairs"], turned)

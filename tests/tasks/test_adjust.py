@@ -157,3 +157,21 @@ def test_the_robust_threshold_matters(threshold):
     found = adjust.adjust(24, links, None, poses.R_local_camera[0], AdjustParameters(robust_threshold=threshold))
     pulled = scenes.true_motion(found.poses, 4, 5)[1][0] - t[0]
     assert (abs(pulled) < 0.004) == (threshold < 1)
+
+
+def test_images_that_lie_the_other_way_round_are_found_and_turned():
+    rng, poses = np.random.default_rng(7), _survey()
+    other_way = np.zeros(len(poses.C_local), bool)
+    other_way[8:16] = True  # the second line
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    navigation = _navigation(poses, rng)
+    seen = Poses(
+        np.where(other_way[:, None, None], poses.R_local_camera @ half_turn, poses.R_local_camera), poses.C_local
+    )
+    links = [link._replace(turned=(other_way[link.i], other_way[link.j])) for link in _links(seen, rng)]
+    links[5] = links[5]._replace(turned=(True, True))  # one vote is not the majority
+    found = _run(poses, links, navigation)
+    assert (found.turned == other_way).all()
+    assert 0.0005 < _rigid_rms(found.poses.C_local, poses.C_local) < 0.01
+    turn = Rotation.from_matrix(found.poses.R_local_camera.transpose(0, 2, 1) @ seen.R_local_camera)
+    assert np.degrees(turn.magnitude()).max() < 3

@@ -116,3 +116,16 @@ def test_sampson_and_depths_of_perfect_matches():
     X_i = np.column_stack([x_i, np.ones(len(x_i))]) * depth_i[:, None]
     X_j = np.column_stack([x_j, np.ones(len(x_j))]) * depth_j[:, None]
     np.testing.assert_allclose(X_i, X_j @ R.T + t, atol=1e-9)
+
+
+@pytest.mark.parametrize("relief_m", [0.0, 0.3])
+def test_an_error_that_soundings_share_is_an_error_of_the_scale(relief_m):
+    points, poses, rng = scenes.seabed(relief_m), scenes.cameras([[0, 0, 0], [0, 0.6, 0]]), np.random.default_rng(3)
+    x = scenes.matches(points, poses, 0, 1, rng)
+    X = [scenes.laser(points, poses, k, rng) for k in (0, 1)]
+    alone, shared = (motion.estimate(*x, *X, scenes.FOCAL_PX, MatchParameters(), None, s) for s in (0.0, 0.02))
+    along = shared.t_i_j / np.linalg.norm(shared.t_i_j)
+    in_camera_j = shared.R_i_j.T @ along
+    sigma = np.sqrt(in_camera_j @ shared.covariance[3:, 3:] @ in_camera_j) / np.linalg.norm(shared.t_i_j)
+    assert alone.scale_sigma < 0.01 < 0.02 <= shared.scale_sigma < 0.025
+    assert 0.019 < sigma < 0.03

@@ -1,5 +1,7 @@
 import numpy as np
 import pyproj
+import pytest
+from scipy.spatial.transform import Rotation
 from seamosaic.schemas.calibration import Mount
 from seamosaic.tasks import navigation, rotations
 from seamosaic.tasks.frames import MapFrame
@@ -54,3 +56,15 @@ def test_relative_uncertainty_walks_and_is_bounded_by_the_absolute():
     np.testing.assert_allclose(near.t_i_j, [1, 0, 0], atol=1e-12)
     # heading is the rotation about the optical axis
     assert abs(near.covariance[2, 2] - 2 * turned**2) < 1e-9
+
+
+@pytest.mark.parametrize("turned", [(True, False), (False, True), (True, True)])
+def test_a_half_turned_motion_is_that_of_half_turned_cameras(turned):
+    prior = _prior([0, 4])
+    tilted = Rotation.from_rotvec([[0.02, -0.01, 0.3], [-0.03, 0.02, 0.1]]).as_matrix()
+    prior = prior._replace(poses=prior.poses._replace(R_local_camera=prior.poses.R_local_camera @ tilted))
+    expected = navigation.relative(navigation.with_half_turns(prior, np.array(turned)), 0, 1)
+    found = navigation.with_half_turn(navigation.relative(prior, 0, 1), *turned)
+    np.testing.assert_allclose(found.R_i_j, expected.R_i_j, atol=1e-12)
+    np.testing.assert_allclose(found.t_i_j, expected.t_i_j, atol=1e-12)
+    np.testing.assert_allclose(found.covariance[3:, 3:], expected.covariance[3:, 3:], atol=1e-12)

@@ -44,3 +44,8 @@ def test_no_depth_without_parallax():
     near = poses._replace(C_local=np.array([[0, 0, 0], [0, 0.01, 0]]))
     uv_j = _pixels(points, near, 1)
     assert len(tiepoints.triangulate(LENS, uv_i, uv_j, near, 0, 1, COVARIANCE).X_local) == 0
+
+
+def test_points_that_say_nothing_are_left_out():
+    _, poses, (uv_i, uv_j) = _scene(0.2)
+    assert len(tiepoints.triangulate(LENS, uv_i, uv_j, poses, 0, 1, COVARIANCE * 30**2).X_local) == 0

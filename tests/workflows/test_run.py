@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import laspy
 import numpy as np
 import pyogrio
@@ -16,6 +17,7 @@ import pytest
 import rasterio
 import trimesh
 import xarray
+import yaml
 from rio_cogeo import cog_validate
 from seamosaic.catalog import trajectories
 from seamosaic.schemas.parameters import Parameters
@@ -234,3 +236,34 @@ def test_without_navigation_without_light_and_in_turns(scene, tmp_path):
     assert quality.soundings.count > 500
     assert (quality.mission.crs is None) == (scene == "pool")
     assert (quality.mosaic.area_m2 > 1) == (scene != "night")
+
+
+def test_photographs_turned_by_a_viewer_are_placed_and_named(tmp_path):
+    mission = small_mission(tmp_path / "mission", "reef", images=4, survey={"lines": 1})
+    turned = sorted((mission / "images").iterdir())[:1]
+    for path in turned:
+        image = cv2.imread(str(path))
+        cv2.imwrite(str(path), cv2.rotate(image, cv2.ROTATE_180), [cv2.IMWRITE_JPEG_QUALITY, 95])
+    _without_laser(mission)
+    quality = run(str(mission), tmp_path / "out", Parameters(), scheduler="sync").quality
+    assert quality.trajectory.adjusted == 4
+    (warning,) = [text for text in quality.warnings if "other way round" in text]
+    assert warning.startswith("1 of 4 images")
+    assert turned[0].name in warning
+
+
+def _without_laser(mission):
+    """Strobe images only: a turned photograph would show the laser where no calibration has it."""
+    for name, key in (("calibration.yaml", "laser"), ("mission.yaml", "")):
+        document = yaml.safe_load((mission / name).read_text())
+        document.pop(key, None)
+        for entry in document.get("images", []):
+            entry["role"] = "texture"
+        (mission / name).write_text(yaml.safe_dump(document))
+
+
+def test_laser_images_sound_for_the_texture_images_beside_them(tmp_path):
+    mission = small_mission(tmp_path / "mission", "pairs", images=8)
+    result = run(str(mission), tmp_path / "out", Parameters(), scheduler="sync")
+    figures = evaluate(result.path, mission)
+    assert 0 < abs(figures["trajectory"]["scale_error_pct"]) < 1
