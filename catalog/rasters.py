@@ -325,9 +325,3 @@ def _valid_blocks(file: rasterio.DatasetReader):
         valid = file.read_masks(1, window=window) > 0
         if valid.any():
             yield file.read(1, window=window)[valid].astype(np.float64)
-
-
-def pixel_count(path: str | os.PathLike[str]) -> int:
-    """Pixels with a value, block by block; for rasters with a mask too."""
-    with gdal_settings(), rasterio.open(path) as file:
-        return sum(int((file.read_masks(1, window=window) > 0).sum()) for _, window in file.block_windows(1))

@@ -27,9 +27,6 @@ class LocalAffine(NamedTuple):
     matrix: Array
     offset: Array
 
-    def to_local(self, X_map: Array) -> Array:
-        return X_map @ self.matrix.T + self.offset
-
 
 class MapFrame:
     """Carries points and rotations between local and map.

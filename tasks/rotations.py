@@ -35,12 +35,6 @@ def quaternion_wxyz(R: Array) -> Array:
     )
 
 
-def matrix_from_wxyz(quaternion: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) as w x y z."""
-    q = np.asarray(quaternion, float)
-    return Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_matrix().reshape(*q.shape[:-1], 3, 3)
-
-
 def angle_between_deg(R_a: Array, R_b: Array) -> float:
     """Angle in degrees of the rotation that takes one (3, 3) attitude to the other."""
     return float(np.degrees(Rotation.from_matrix(R_a.T @ R_b).magnitude()))

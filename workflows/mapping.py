@@ -8,9 +8,10 @@ from dask.delayed import delayed
 from ..tasks import camera as cameras
 from ..tasks import grids, pairs
 from ..tasks.grids import Grid
-from . import maps, products
+from . import maps
 from .job import Done
 from .maps import Image, MapJob, Pair, Tile
+from .results import Mapped, Posed, Tiles
 from .session import Session, compute
 from .solve import Solution
 
@@ -23,7 +24,7 @@ class NothingToMap(RuntimeError):
     """No image of the mission gave a sounding or a match."""
 
 
-def map_tiles(state: Session, posed: products.Posed) -> products.Mapped:
+def map_tiles(state: Session, posed: Posed) -> Mapped:
     """Tiles: cells, surface, mosaics."""
     job, p = state.job, state.job.parameters
     images = _images(state, posed)
@@ -42,10 +43,10 @@ def map_tiles(state: Session, posed: products.Posed) -> products.Mapped:
     light = _lighting(state, textured)
     by_row = {image.row: float(ranges[image.row]) for image in textured}
     ortho, planar = _mosaics(state, m, textured, outlines, surface_tiles, mosaic_cell, light, posed, by_row)
-    return products.Mapped(m, cell, mosaic_cell, surface_tiles, ortho, planar, outlines)
+    return Mapped(m, cell, mosaic_cell, surface_tiles, ortho, planar, outlines)
 
 
-def _images(state: Session, posed: products.Posed) -> list[Image]:
+def _images(state: Session, posed: Posed) -> list[Image]:
     """Images with a pose whose extraction went well."""
     known = posed.solution.poses.known
     return [
@@ -89,7 +90,7 @@ def _bounds(outlines: np.ndarray, images: Sequence[Image]) -> grids.Bounds:
     return grids.Bounds(float(west), float(south), float(east), float(north))
 
 
-def _linked(posed: products.Posed) -> list[Pair]:
+def _linked(posed: Posed) -> list[Pair]:
     """The pairs that hold the adjustment."""
     keys = {(i, j): done.key for i, j, done in posed.matched}
     return [Pair(i, j, keys[i, j]) for i, j in posed.solution.pairs.tolist()]
@@ -101,8 +102,8 @@ def _of_images(linked: Sequence[Pair], images: Sequence[Image]) -> tuple[Pair, .
 
 
 def _surface(
-    state: Session, m: MapJob, posed: products.Posed, images: Sequence[Image], outlines: np.ndarray, cell: float
-) -> products.Tiles:
+    state: Session, m: MapJob, posed: Posed, images: Sequence[Image], outlines: np.ndarray, cell: float
+) -> Tiles:
     """Bathymetry: cells of each tile, the law of interpolation, then the surface of each tile."""
     size = state.job.parameters.grid.tile_cells
     margin = _margin(outlines, images)
@@ -135,7 +136,7 @@ def _surface(
     surfaces: list[Done] = compute(state, maps.SURFACE, surface_tasks)
     for step, done in zip(steps, (cells, [growth], surfaces), strict=True):
         state.ledger.end(step, done)
-    return products.Tiles(grid, tuple(zip(tiles, surfaces, strict=True)))
+    return Tiles(grid, tuple(zip(tiles, surfaces, strict=True)))
 
 
 def _lighting(state: Session, images: Sequence[Image]) -> Done | None:
@@ -154,12 +155,12 @@ def _mosaics(
     m: MapJob,
     images: Sequence[Image],
     outlines: np.ndarray,
-    ground: products.Tiles,
+    ground: Tiles,
     cell: float,
     light: Done | None,
-    posed: products.Posed,
+    posed: Posed,
     ranges: dict[int, float],
-) -> tuple[products.Tiles, products.Tiles]:
+) -> tuple[Tiles, Tiles]:
     """Orthomosaic and planar mosaic on one grid."""
     shown = images or _images(state, posed)
     grid = grids.grid_around(_bounds(outlines, shown), cell)
@@ -184,8 +185,8 @@ def _mosaics(
     for step, results in zip(steps, (ortho, [aligned], planar), strict=True):
         state.ledger.end(step, results)
     return (
-        products.Tiles(grid, tuple(zip(tiles, ortho, strict=True))),
-        products.Tiles(grid, tuple(zip(tiles, planar, strict=True))),
+        Tiles(grid, tuple(zip(tiles, ortho, strict=True))),
+        Tiles(grid, tuple(zip(tiles, planar, strict=True))),
     )
 
 

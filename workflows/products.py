@@ -1,11 +1,10 @@
 """From stored results to a version's folder: every product of FORMATS, with quality figures and provenance."""
 
 import sys
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyproj
@@ -18,27 +17,13 @@ from ..catalog.mission_files import MissionFiles
 from ..catalog.missions import OpenedMission
 from ..catalog.store import digest
 from ..schemas.mission import Mission
-from ..schemas.products import (
-    AxisDifference,
-    BathymetryQuality,
-    ImageCounts,
-    MeshQuality,
-    MissionSummary,
-    MosaicQuality,
-    NavigationDifference,
-    PairQuality,
-    Quality,
-    SoundingQuality,
-    SourceShares,
-    TrajectoryQuality,
-)
-from ..schemas.provenance import InputFile, Provenance, Step
+from ..schemas.products import MeshQuality, Quality
+from ..schemas.provenance import InputFile, Provenance
 from ..tasks import mesh, rotations
 from ..tasks.grids import Bounds, Grid
-from . import extract, maps, report, report_figures
-from .job import Done, Job, code_version, load
-from .maps import MapJob
-from .plan import Plan
+from . import extract, maps, quality, report, report_figures
+from .job import code_version, load
+from .results import Results, span, vertical_reference
 from .solve import Solution
 
 _VERSION = code_version(
@@ -53,49 +38,10 @@ _VERSION = code_version(
     vectors,
     mesh,
     report,
+    quality,
 )
 _MESH_CELLS = 2_000_000
 _NAMED_BY = ("image", "role", "time", "status", "sha256")
-
-
-class Posed(NamedTuple):
-    """Results of the images and pairs: extraction by row, matches, the adjustment."""
-
-    extracted: dict[int, Done]
-    matched: list[tuple[int, int, Done]]
-    adjusted: Done
-    solution: Solution
-
-
-class Tiles(NamedTuple):
-    """A map: its grid and the results of its tiles."""
-
-    grid: Grid
-    tiles: tuple[tuple[Grid, Done], ...]
-
-
-class Mapped(NamedTuple):
-    """Results of the map tiles. outlines : (n, M, 2) footprints in map coordinates."""
-
-    map_job: MapJob
-    cell_m: float
-    mosaic_cell_m: float
-    surface: Tiles
-    orthomosaic: Tiles
-    planar: Tiles
-    outlines: np.ndarray
-
-
-class Results(NamedTuple):
-    """All that products are made from."""
-
-    job: Job
-    opened: OpenedMission
-    plan: Plan
-    out: Path
-    steps: tuple[Step, ...]
-    posed: Posed
-    mapped: Mapped
 
 
 def write(results: Results) -> tuple[Path, bool, Quality]:
@@ -111,9 +57,9 @@ def write(results: Results) -> tuple[Path, bool, Quality]:
     if isinstance(writer, Path):
         return writer, False, Quality.model_validate_json((writer / "quality.json").read_text(encoding="utf-8"))
     with writer:
-        quality = _write_all(results, writer.folder, made_from)
+        figures = _write_all(results, writer.folder, made_from)
     assert writer.path is not None
-    return writer.path, True, quality
+    return writer.path, True, figures
 
 
 def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
@@ -125,26 +71,19 @@ def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
     count = _write_soundings(results, folder, crs_wkt)
     triangles = _write_mesh(folder, crs_wkt, results)
     _write_survey(results, folder, crs_wkt, rows)
-    quality = _quality(results, folder, rows, navigation, count, triangles)
-    metadata.write_quality(folder / "quality.json", quality)
+    figures = quality.figures(results, folder, rows, navigation, count, triangles)
+    metadata.write_quality(folder / "quality.json", figures)
     provenance = _provenance(results, made_from)
-    report.write_report(folder, quality, provenance, None if results.plan.prior is None else navigation)
+    report.write_report(folder, figures, provenance, None if results.plan.prior is None else navigation)
     if results.opened.crs is not None:
-        start, end = _span(results.opened)
+        start, end = span(results.opened)
         mission = results.opened.mission
         newest = versions.newest_version(results.out, mission.id)
         number = newest.number + 1 if newest else 1
         metadata.write_stac_item(folder, mission.id, number, mission.title, start, end, _about(mission))
     provenance = provenance.model_copy(update={"outputs": metadata.output_digests(folder)})
     metadata.write_provenance(folder / "metadata" / "provenance.json", provenance)
-    return quality
-
-
-def _span(opened: OpenedMission) -> tuple[datetime, datetime]:
-    """First and last exposure; an image without a time has none."""
-    times = opened.frames["time"].values
-    times = times[~np.isnat(times)]
-    return _utc(times.min()), _utc(times.max())
+    return figures
 
 
 def _about(mission: Mission) -> dict[str, str]:
@@ -152,10 +91,6 @@ def _about(mission: Mission) -> dict[str, str]:
     given = {} if mission.reporting is None else mission.reporting.model_dump(exclude_none=True)
     named = {"platform": mission.platform, "license": given.pop("licence", "")}
     return {name: value for name, value in {**named, **given}.items() if value}
-
-
-def _utc(time: np.datetime64) -> datetime:
-    return datetime.fromtimestamp(float(time.astype("datetime64[us]").astype(np.int64)) / 1e6, UTC)
 
 
 def _product_crs(opened: OpenedMission) -> str:
@@ -167,15 +102,6 @@ def _product_crs(opened: OpenedMission) -> str:
         return horizontal.to_wkt()
     vertical = pyproj.CRS.from_wkt(opened.vertical)
     return CompoundCRS(f"{horizontal.name} + {vertical.name}", [horizontal, vertical]).to_wkt()
-
-
-def vertical_reference(opened: OpenedMission) -> str:
-    """What elevations are measured from, in words."""
-    if opened.crs is None:
-        return "the first image's centre of projection"
-    if opened.vertical is not None:
-        return pyproj.CRS.from_wkt(opened.vertical).name
-    return "the sea surface at survey time"
 
 
 def _trajectory(results: Results) -> tuple[list[trajectories.Row], np.ndarray]:
@@ -335,128 +261,6 @@ def _write_survey(results: Results, folder: Path, crs_wkt: str, rows: Sequence[t
         vectors.contours(overview, vectors.contour_interval(elevation)),
         vectors.coverage(overview),
     )
-
-
-def _quality(
-    results: Results,
-    folder: Path,
-    rows: Sequence[trajectories.Row],
-    navigation: np.ndarray,
-    soundings: int,
-    triangles: MeshQuality,
-) -> Quality:
-    opened = results.opened
-    roles = Counter(str(role) for role in opened.frames["role"].values)
-    start, end = _span(opened)
-    return Quality(
-        mission=MissionSummary(
-            id=opened.mission.id,
-            title=opened.mission.title,
-            platform=opened.mission.platform,
-            start=start,
-            end=end,
-            crs=None if opened.crs is None else pyproj.CRS.from_wkt(opened.crs).name,
-            vertical_reference=vertical_reference(opened),
-            images=ImageCounts(total=len(rows), by_role=dict(roles), by_status=dict(Counter(row.kind for row in rows))),
-        ),
-        soundings=_sounding_quality(results, soundings),
-        pairs=_pair_quality(results),
-        trajectory=_trajectory_quality(rows, navigation),
-        bathymetry=_bathymetry_quality(folder, results.mapped.cell_m),
-        mosaic=_mosaic_quality(results),
-        mesh=triangles,
-        warnings=(*opened.warnings, *_doubts(rows, results)),
-    )
-
-
-def _doubts(rows: Sequence[trajectories.Row], results: Results) -> Iterator[str]:
-    """What the figures show but a hurried reader may miss."""
-    alone = sum(row.kind == "navigation" for row in rows)
-    if alone:
-        yield f"{alone} of {len(rows)} images are placed by navigation alone: no match with another image holds them"
-    turned = [rows[k].image for k in np.flatnonzero(results.posed.solution.turned).tolist()]
-    if turned:
-        names = ", ".join(turned[:6]) + (" ..." if len(turned) > 6 else "")
-        yield (
-            f"{len(turned)} of {len(rows)} images lie the other way round than mount and heading say, by their matches "
-            f"with others, and were placed so (turned by a picture viewer? flown backwards?): {names}"
-        )
-    if results.posed.matched and not len(results.posed.solution.pairs):
-        yield f"none of {len(results.posed.matched)} pairs of images could be linked"
-
-
-def _sounding_quality(results: Results, count: int) -> SoundingQuality | None:
-    if results.opened.calibration.laser is None:
-        return None
-    lit = [done for done in results.posed.extracted.values() if "soundings" in done.info]
-    sigmas = [done.info["sigma_m"] for done in lit if done.info.get("sigma_m")]
-    return SoundingQuality(
-        count=count,
-        per_image_median=float(np.median([done.info["soundings"] for done in lit])) if lit else None,
-        sigma_median_m=float(np.median(sigmas)) if sigmas else None,
-        reasons=dict(Counter(done.info["reason"] for done in lit if done.info.get("reason"))),
-    )
-
-
-def _pair_quality(results: Results) -> PairQuality:
-    used = {(int(i), int(j)) for i, j in results.posed.solution.pairs}
-    linked = [done.info for i, j, done in results.posed.matched if (i, j) in used]
-    models = Counter(info["model"] for info in linked)
-    return PairQuality(
-        tried=len(results.posed.matched),
-        linked=len(linked),
-        homography=models["homography"],
-        essential=models["essential"],
-        median_inliers=float(np.median([info["inliers"] for info in linked])) if linked else None,
-    )
-
-
-def _trajectory_quality(rows: Sequence[trajectories.Row], navigation: np.ndarray) -> TrajectoryQuality:
-    kinds = Counter(row.kind for row in rows)
-    placed = [(k, row.pose) for k, row in enumerate(rows) if row.pose is not None]
-    positions = np.array([pose.position for _, pose in placed]).reshape(-1, 3)
-    difference = navigation[[k for k, _ in placed]] - positions if placed else np.zeros((0, 3))
-    difference = difference[np.isfinite(difference).all(1)]
-    sigmas = np.array([pose.sigma for _, pose in placed]).reshape(-1, 3)
-    return TrajectoryQuality(
-        adjusted=kinds["adjusted"],
-        navigation_only=kinds["navigation"],
-        rejected=kinds["rejected"],
-        navigation_minus_adjusted=_difference(difference) if len(difference) else None,
-        sigma_median_m=tuple(np.median(sigmas, axis=0).tolist()) if len(sigmas) else None,
-    )
-
-
-def _difference(difference: np.ndarray) -> NavigationDifference:
-    x, y, z = (
-        AxisDifference(rms_m=float(np.sqrt(np.mean(axis**2))), max_m=float(np.abs(axis).max())) for axis in difference.T
-    )
-    return NavigationDifference(x=x, y=y, z=z)
-
-
-def _bathymetry_quality(folder: Path, cell_m: float) -> BathymetryQuality:
-    heights, sigma = rasters.summarise(folder / "bathymetry.tif"), rasters.summarise(folder / "uncertainty.tif")
-    codes = rasters.count_codes(folder / "source.tif")
-    total = sum(codes.get(code, 0) for code in (1, 2, 3))
-    shares = [codes.get(code, 0) / total if total else 0.0 for code in (1, 2, 3)]
-    return BathymetryQuality(
-        cell_m=cell_m,
-        cells=total,
-        area_m2=total * cell_m**2,
-        by_source=SourceShares(laser=shares[0], image_matching=shares[1], interpolated=shares[2]),
-        elevation_min_m=heights.minimum,
-        elevation_median_m=heights.median,
-        elevation_max_m=heights.maximum,
-        sigma_median_m=sigma.median,
-    )
-
-
-def _mosaic_quality(results: Results) -> MosaicQuality:
-    cell = results.mapped.mosaic_cell_m
-    pixels = sum(done.info["pixels"] for _, done in results.mapped.orthomosaic.tiles)
-    surface = sum(done.info["cells"] for _, done in results.mapped.surface.tiles) * results.mapped.cell_m**2
-    area = pixels * cell**2
-    return MosaicQuality(cell_m=cell, area_m2=area, coverage_share=min(1.0, area / surface) if surface else None)
 
 
 def _provenance(results: Results, made_from: str) -> Provenance:

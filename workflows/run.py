@@ -19,6 +19,7 @@ from . import extract, mapping, maps, match, plan, products, solve
 from .executor import open_executor
 from .job import Done, Job, load, log
 from .plan import Plan
+from .results import Posed, Results
 from .session import Ledger, Session, compute
 
 _IMAGES_A_BATCH = 4
@@ -70,7 +71,7 @@ def run(
         posed = _poses(state)
         mapped = mapping.map_tiles(state, posed)
     steps = state.ledger.steps(_VERSIONS)
-    path, new, quality = products.write(products.Results(job, opened, state.plan, Path(out), steps, posed, mapped))
+    path, new, quality = products.write(Results(job, opened, state.plan, Path(out), steps, posed, mapped))
     return RunResult(path, new, quality, steps)
 
 
@@ -98,7 +99,7 @@ def _open(mission_url: str, out: Path) -> OpenedMission:
     return opened
 
 
-def _poses(state: Session) -> products.Posed:
+def _poses(state: Session) -> Posed:
     """One graph over batches of images, then pairs, then the adjustment; without navigation, loops after it."""
     job, made = state.job, state.plan
     for step in (extract.STEP, match.STEP, solve.STEP):
@@ -119,7 +120,7 @@ def _poses(state: Session) -> products.Posed:
     state.ledger.end(extract.STEP, list(extracted.values()))
     state.ledger.end(match.STEP, [done for _, _, done in matched])
     state.ledger.end(solve.STEP, [adjusted])
-    return products.Posed(extracted, matched, adjusted, _solution(job, adjusted))
+    return Posed(extracted, matched, adjusted, _solution(job, adjusted))
 
 
 def _close_loops(

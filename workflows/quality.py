@@ -1,0 +1,152 @@
+"""The figures of quality.json: what a run counted and measured of its own results."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyproj
+
+from ..catalog import rasters, trajectories
+from ..schemas.products import (
+    AxisDifference,
+    BathymetryQuality,
+    ImageCounts,
+    MeshQuality,
+    MissionSummary,
+    MosaicQuality,
+    NavigationDifference,
+    PairQuality,
+    Quality,
+    SoundingQuality,
+    SourceShares,
+    TrajectoryQuality,
+)
+from .results import Results, span, vertical_reference
+
+
+def figures(
+    results: Results,
+    folder: Path,
+    rows: Sequence[trajectories.Row],
+    navigation: np.ndarray,
+    soundings: int,
+    triangles: MeshQuality,
+) -> Quality:
+    """All figures of a version.
+
+    rows : of trajectory.csv. navigation : its camera centres (n, 3), map. soundings : how many were written.
+    folder : where the rasters are.
+    """
+    opened = results.opened
+    roles = Counter(str(role) for role in opened.frames["role"].values)
+    start, end = span(opened)
+    return Quality(
+        mission=MissionSummary(
+            id=opened.mission.id,
+            title=opened.mission.title,
+            platform=opened.mission.platform,
+            start=start,
+            end=end,
+            crs=None if opened.crs is None else pyproj.CRS.from_wkt(opened.crs).name,
+            vertical_reference=vertical_reference(opened),
+            images=ImageCounts(total=len(rows), by_role=dict(roles), by_status=dict(Counter(row.kind for row in rows))),
+        ),
+        soundings=_sounding_quality(results, soundings),
+        pairs=_pair_quality(results),
+        trajectory=_trajectory_quality(rows, navigation),
+        bathymetry=_bathymetry_quality(folder, results.mapped.cell_m),
+        mosaic=_mosaic_quality(results),
+        mesh=triangles,
+        warnings=(*opened.warnings, *_doubts(rows, results)),
+    )
+
+
+def _doubts(rows: Sequence[trajectories.Row], results: Results) -> Iterator[str]:
+    """What the figures show but a hurried reader may miss."""
+    alone = sum(row.kind == "navigation" for row in rows)
+    if alone:
+        yield f"{alone} of {len(rows)} images are placed by navigation alone: no match with another image holds them"
+    turned = [rows[k].image for k in np.flatnonzero(results.posed.solution.turned).tolist()]
+    if turned:
+        names = ", ".join(turned[:6]) + (" ..." if len(turned) > 6 else "")
+        yield (
+            f"{len(turned)} of {len(rows)} images lie the other way round than mount and heading say, by their matches "
+            f"with others, and were placed so (turned by a picture viewer? flown backwards?): {names}"
+        )
+    if results.posed.matched and not len(results.posed.solution.pairs):
+        yield f"none of {len(results.posed.matched)} pairs of images could be linked"
+
+
+def _sounding_quality(results: Results, count: int) -> SoundingQuality | None:
+    if results.opened.calibration.laser is None:
+        return None
+    lit = [done for done in results.posed.extracted.values() if "soundings" in done.info]
+    sigmas = [done.info["sigma_m"] for done in lit if done.info.get("sigma_m")]
+    return SoundingQuality(
+        count=count,
+        per_image_median=float(np.median([done.info["soundings"] for done in lit])) if lit else None,
+        sigma_median_m=float(np.median(sigmas)) if sigmas else None,
+        reasons=dict(Counter(done.info["reason"] for done in lit if done.info.get("reason"))),
+    )
+
+
+def _pair_quality(results: Results) -> PairQuality:
+    used = {(int(i), int(j)) for i, j in results.posed.solution.pairs}
+    linked = [done.info for i, j, done in results.posed.matched if (i, j) in used]
+    models = Counter(info["model"] for info in linked)
+    return PairQuality(
+        tried=len(results.posed.matched),
+        linked=len(linked),
+        homography=models["homography"],
+        essential=models["essential"],
+        median_inliers=float(np.median([info["inliers"] for info in linked])) if linked else None,
+    )
+
+
+def _trajectory_quality(rows: Sequence[trajectories.Row], navigation: np.ndarray) -> TrajectoryQuality:
+    kinds = Counter(row.kind for row in rows)
+    placed = [(k, row.pose) for k, row in enumerate(rows) if row.pose is not None]
+    positions = np.array([pose.position for _, pose in placed]).reshape(-1, 3)
+    difference = navigation[[k for k, _ in placed]] - positions if placed else np.zeros((0, 3))
+    difference = difference[np.isfinite(difference).all(1)]
+    sigmas = np.array([pose.sigma for _, pose in placed]).reshape(-1, 3)
+    return TrajectoryQuality(
+        adjusted=kinds["adjusted"],
+        navigation_only=kinds["navigation"],
+        rejected=kinds["rejected"],
+        navigation_minus_adjusted=_difference(difference) if len(difference) else None,
+        sigma_median_m=tuple(np.median(sigmas, axis=0).tolist()) if len(sigmas) else None,
+    )
+
+
+def _difference(difference: np.ndarray) -> NavigationDifference:
+    x, y, z = (
+        AxisDifference(rms_m=float(np.sqrt(np.mean(axis**2))), max_m=float(np.abs(axis).max())) for axis in difference.T
+    )
+    return NavigationDifference(x=x, y=y, z=z)
+
+
+def _bathymetry_quality(folder: Path, cell_m: float) -> BathymetryQuality:
+    heights, sigma = rasters.summarise(folder / "bathymetry.tif"), rasters.summarise(folder / "uncertainty.tif")
+    codes = rasters.count_codes(folder / "source.tif")
+    total = sum(codes.get(code, 0) for code in (1, 2, 3))
+    shares = [codes.get(code, 0) / total if total else 0.0 for code in (1, 2, 3)]
+    return BathymetryQuality(
+        cell_m=cell_m,
+        cells=total,
+        area_m2=total * cell_m**2,
+        by_source=SourceShares(laser=shares[0], image_matching=shares[1], interpolated=shares[2]),
+        elevation_min_m=heights.minimum,
+        elevation_median_m=heights.median,
+        elevation_max_m=heights.maximum,
+        sigma_median_m=sigma.median,
+    )
+
+
+def _mosaic_quality(results: Results) -> MosaicQuality:
+    cell = results.mapped.mosaic_cell_m
+    pixels = sum(done.info["pixels"] for _, done in results.mapped.orthomosaic.tiles)
+    surface = sum(done.info["cells"] for _, done in results.mapped.surface.tiles) * results.mapped.cell_m**2
+    area = pixels * cell**2
+    return MosaicQuality(cell_m=cell, area_m2=area, coverage_share=min(1.0, area / surface) if surface else None)

@@ -1,0 +1,76 @@
+"""What the steps of a run came to, as the products are made from it."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyproj
+
+from ..catalog.missions import OpenedMission
+from ..schemas.provenance import Step
+from ..tasks.grids import Grid
+from .job import Done, Job
+from .maps import MapJob
+from .plan import Plan
+from .solve import Solution
+
+
+class Posed(NamedTuple):
+    """Results of the images and pairs: extraction by row, matches, the adjustment."""
+
+    extracted: dict[int, Done]
+    matched: list[tuple[int, int, Done]]
+    adjusted: Done
+    solution: Solution
+
+
+class Tiles(NamedTuple):
+    """A map: its grid and the results of its tiles."""
+
+    grid: Grid
+    tiles: tuple[tuple[Grid, Done], ...]
+
+
+class Mapped(NamedTuple):
+    """Results of the map tiles. outlines : (n, M, 2) footprints in map coordinates."""
+
+    map_job: MapJob
+    cell_m: float
+    mosaic_cell_m: float
+    surface: Tiles
+    orthomosaic: Tiles
+    planar: Tiles
+    outlines: np.ndarray
+
+
+class Results(NamedTuple):
+    """All that products are made from."""
+
+    job: Job
+    opened: OpenedMission
+    plan: Plan
+    out: Path
+    steps: tuple[Step, ...]
+    posed: Posed
+    mapped: Mapped
+
+
+def span(opened: OpenedMission) -> tuple[datetime, datetime]:
+    """First and last exposure; an image without a time has none."""
+    times = opened.frames["time"].values
+    times = times[~np.isnat(times)]
+    return _utc(times.min()), _utc(times.max())
+
+
+def _utc(time: np.datetime64) -> datetime:
+    return datetime.fromtimestamp(float(time.astype("datetime64[us]").astype(np.int64)) / 1e6, UTC)
+
+
+def vertical_reference(opened: OpenedMission) -> str:
+    """What elevations are measured from, in words."""
+    if opened.crs is None:
+        return "the first image's centre of projection"
+    if opened.vertical is not None:
+        return pyproj.CRS.from_wkt(opened.vertical).name
+    return "the sea surface at survey time"
