@@ -75,7 +75,16 @@ class MatchParameters(Model):
 class AdjustParameters(Model):
     """The global estimate that holds the chain of motions to navigation (paper IV)."""
 
-    robust_threshold: Annotated[float, Field(gt=0, description="Huber, in sigmas, on pair motions")] = 1.5
+    robust_threshold: Annotated[
+        float, Field(gt=0, description="in sigmas: Huber on pair motions, Cauchy at twice that on tie points")
+    ] = 1.5
+    tie_cells: Annotated[
+        int, Field(ge=4, le=64, description="cells along an image's longer side, each with its share of tie points")
+    ] = 16
+    tie_points_per_cell: Annotated[int, Field(ge=1, le=50)] = 2
+    max_ranges: Annotated[
+        int, Field(ge=0, le=2000, description="tie points of an image that its laser tells the range of, at most")
+    ] = 150
     drift_m_per_sqrt_s: Annotated[
         float, Field(gt=0, description="random walk of dead reckoning, metres per root second")
     ] = 0.02

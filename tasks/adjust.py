@@ -1,30 +1,28 @@
 """All poses from pair motions and navigation in one estimate (paper IV and its outlook), solved by GTSAM.
 
-Navigation's errors are modelled as they are: roll, pitch and depth as independent noise, heading as a bias of the
-whole track, horizontal position as one offset (sigma_horizontal) plus a random walk from image to image. Pair motions
-enter as relative poses with their covariance under a robust kernel. Without navigation the first image is the datum
-and the motions are chained from it (paper IV).
+Navigation's errors are modelled as they are: roll and pitch as independent noise, heading as a bias of the whole
+track, depth as a bias and noise, horizontal position as one offset (sigma_horizontal) plus a random walk from image to
+image. Pair motions enter as relative poses with their covariance under a robust kernel. Without navigation the first
+image is the datum and the motions are chained from it (paper IV). `tasks.bundle` takes it from here.
 """
 
-import itertools
 from typing import Any, Literal, NamedTuple
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from ..schemas.parameters import AdjustParameters
+from .factors import datum, first_values, gaussian, navigation_factors, pose
 from .motion import Motion
-from .navigation import NavigationPrior, Poses, relative, walk_m, with_half_turns
+from .navigation import NavigationPrior, Poses, relative, with_half_turns
 
 Array = NDArray[Any]
 Status = Literal["adjusted", "navigation", "rejected: no link to the first image"]
 
-_DATUM_SIGMA = 1e-5
-_EXACT_M, _EXACT_RAD, _ANYWHERE_M = 1e-3, 1e-4, 1e3
+_TURN = np.radians(2.0)
 # what calibration and the pinhole leave in a pair motion, whatever its matches say: 0.01 degree and 1 mm
 _LINK_FLOOR = np.diag([np.radians(0.01)] * 3 + [1e-3] * 3) ** 2
 
@@ -83,9 +81,7 @@ def adjust(
     values = _solve(graph, usable, start, kernel)
     kept = {(link.i, link.j) for link in usable}
     poses = _poses(values, start)
-    sigma_m, sigma_tilt = _sigmas(_total(graph, usable, kernel), values, poses)
-    if navigation is not None:  # roll and pitch err by a bias too, which no number of images averages down
-        sigma_tilt = np.hypot(sigma_tilt, navigation.sigma_attitude[:, :2].mean(1))
+    sigma_m, sigma_tilt = sigmas(_total(graph, usable, kernel), values, poses, navigation)
     return Adjusted(
         poses=poses,
         sigma_m=sigma_m,
@@ -112,18 +108,14 @@ def _plausible(link: Link, navigation: NavigationPrior | None) -> bool:
 def _start(count: int, links: list[Link], navigation: NavigationPrior | None, R_first: Array) -> tuple[Poses, Any]:
     """First values of all poses that can have one, and the factors that tie them to the ground."""
     if navigation is not None:
-        return navigation.poses, _navigation_factors(navigation)
+        return navigation.poses, navigation_factors(navigation)
     start = _chain(count, links, R_first)
-    return start, _datum(start, int(np.flatnonzero(start.known)[0]))
+    return start, datum(start, int(np.flatnonzero(start.known)[0]))
 
 
 def _within(links: list[Link], start: Poses) -> list[Link]:
     known = start.known
     return [link for link in links if known[link.i] and known[link.j]]
-
-
-def _pose(R: Array, C: Array) -> Any:
-    return gtsam.Pose3(gtsam.Rot3(R), np.asarray(C, float))
 
 
 def _chain(count: int, links: list[Link], R_first: Array) -> Poses:
@@ -152,64 +144,6 @@ def _chain(count: int, links: list[Link], R_first: Array) -> Poses:
     return Poses(R, C)
 
 
-def _datum(start: Poses, first: int) -> Any:
-    graph = gtsam.NonlinearFactorGraph()
-    noise = gtsam.noiseModel.Isotropic.Sigma(6, _DATUM_SIGMA)
-    graph.add(gtsam.PriorFactorPose3(first, _pose(start.R_local_camera[first], start.C_local[first]), noise))
-    return graph
-
-
-def _navigation_factors(navigation: NavigationPrior) -> Any:
-    """What navigation says, in variables of its own: where it would have been but for its drift.
-
-    A navigation variable keeps navigation's attitude and depth; its horizontal position is that of the camera. So
-    steps are held in the local frame, whatever the heading sensor's error, and the shape of the track helps to
-    orient the map. Offset and heading bias are shared by the whole track: n priors together weigh as much as one
-    measurement of the stated sigma.
-    """
-    graph = gtsam.NonlinearFactorGraph()
-    poses = navigation.poses
-    known = np.flatnonzero(poses.known).tolist()
-    count = len(known)
-    for k in known:
-        R, own = poses.R_local_camera[k], _pose(poses.R_local_camera[k], poses.C_local[k])
-        offset = navigation.sigma_horizontal[k] * np.sqrt(count)
-        graph.add(gtsam.PriorFactorPose3(_of_navigation(k), own, _noise(_EXACT_RAD, R, offset, _EXACT_M)))
-        attitude = _attitude(navigation, k, count)
-        tie = _noise(attitude, R, _EXACT_M, float(navigation.sigma_depth[k]))
-        graph.add(gtsam.BetweenFactorPose3(_of_navigation(k), k, gtsam.Pose3(), tie))
-    for a, b in itertools.pairwise(known):
-        step = relative(navigation, a, b)
-        between, R = _pose(step.R_i_j, step.t_i_j), poses.R_local_camera[b]
-        walk = _noise(_EXACT_RAD, R, walk_m(navigation, a, b) + _EXACT_M, _EXACT_M)
-        graph.add(gtsam.BetweenFactorPose3(_of_navigation(a), _of_navigation(b), between, walk))
-        turn = _noise(step.covariance[:3, :3], R, _ANYWHERE_M, _ANYWHERE_M)
-        graph.add(gtsam.BetweenFactorPose3(a, b, between, turn))
-    return graph
-
-
-def _of_navigation(k: int) -> int:
-    return gtsam.symbol("n", k)
-
-
-def _attitude(navigation: NavigationPrior, k: int, count: int) -> Array:
-    """Covariance (3, 3) of navigation's attitude about the camera's axes; the heading's error is the track's."""
-    R = navigation.R_camera_vehicle
-    return R @ np.diag(navigation.sigma_attitude[k] ** 2 * [1, 1, count]) @ R.T
-
-
-def _noise(rotation: Array | float, R_local_camera: Array, horizontal_m: float, vertical_m: float) -> Any:
-    """Noise of a pose: covariance (3, 3) or sigma of its rotation, sigmas of its position along the local axes."""
-    R = R_local_camera
-    position = R.T @ np.diag([horizontal_m, horizontal_m, vertical_m]) ** 2 @ R
-    turn = rotation if isinstance(rotation, np.ndarray) else np.eye(3) * rotation**2
-    return _gaussian(np.asarray(block_diag(turn, position)))
-
-
-def _gaussian(covariance: Array) -> Any:
-    return gtsam.noiseModel.Gaussian.Covariance((covariance + covariance.T) / 2)
-
-
 def _scaled_by_navigation(link: Link, navigation: NavigationPrior) -> Link:
     """A link without laser scale takes the length of navigation's step, and its uncertainty."""
     motion = link.motion
@@ -228,14 +162,19 @@ def _scaled_by_navigation(link: Link, navigation: NavigationPrior) -> Link:
 
 
 def _agrees_with_navigation(link: Link, navigation: NavigationPrior) -> bool:
-    """Within five sigma of navigation's own motion between the two images: repeated texture makes false links."""
+    """Within five sigma of navigation's own motion between the two images: repeated texture makes false links.
+
+    On a turn attitude changes faster than navigation reports it, so some degrees more are let pass.
+    """
     prior = relative(navigation, link.i, link.j)
-    return _distance(link.motion, _pose(prior.R_i_j, prior.t_i_j), prior.covariance + link.motion.covariance) < 5
+    turn = np.repeat([_TURN, _TURN * float(np.linalg.norm(prior.t_i_j))], 3) ** 2
+    covariance = prior.covariance + link.motion.covariance + np.diag(turn)
+    return _distance(link.motion, pose(prior.R_i_j, prior.t_i_j), covariance) < 5
 
 
 def _distance(motion: Motion, other: Any, covariance: Array) -> float:
     """Mahalanobis distance of a motion from another pose of j in i, divided by the root of the six dimensions."""
-    off = _pose(motion.R_i_j, motion.t_i_j).localCoordinates(other)
+    off = pose(motion.R_i_j, motion.t_i_j).localCoordinates(other)
     return float(np.sqrt(off @ np.linalg.solve(covariance, off) / 6))
 
 
@@ -243,18 +182,13 @@ def _total(graph: Any, links: list[Link], kernel: Any) -> Any:
     """The factors of graph and those of the links under a robust kernel."""
     total = gtsam.NonlinearFactorGraph(graph)
     for link in links:
-        noise = gtsam.noiseModel.Robust.Create(kernel, _gaussian(link.motion.covariance + _LINK_FLOOR))
-        total.add(gtsam.BetweenFactorPose3(link.i, link.j, _pose(link.motion.R_i_j, link.motion.t_i_j), noise))
+        noise = gtsam.noiseModel.Robust.Create(kernel, gaussian(link.motion.covariance + _LINK_FLOOR))
+        total.add(gtsam.BetweenFactorPose3(link.i, link.j, pose(link.motion.R_i_j, link.motion.t_i_j), noise))
     return total
 
 
 def _solve(graph: Any, links: list[Link], start: Poses, kernel: Any) -> Any:
-    values, keys = gtsam.Values(), graph.keys()
-    for k in np.flatnonzero(start.known).tolist():
-        pose = _pose(start.R_local_camera[k], start.C_local[k])
-        values.insert(k, pose)
-        if keys.count(_of_navigation(k)):
-            values.insert(_of_navigation(k), pose)
+    values = first_values(graph, start)
     total = _total(graph, links, kernel)
     return gtsam.LevenbergMarquardtOptimizer(total, values, gtsam.LevenbergMarquardtParams()).optimize()
 
@@ -273,14 +207,17 @@ def _poses(values: Any, start: Poses) -> Poses:
     return Poses(R, C)
 
 
-def _sigmas(total: Any, values: Any, poses: Poses) -> tuple[Array, Array]:
-    marginals = gtsam.Marginals(total, values)
+def sigmas(graph: Any, values: Any, poses: Poses, navigation: NavigationPrior | None) -> tuple[Array, Array]:
+    """Sigmas (n, 3) of the camera centres along the local axes and (n,) of the lean of the optical axes."""
+    marginals = gtsam.Marginals(graph, values)
     count = len(poses.C_local)
     position, tilt = np.full((count, 3), np.nan), np.full(count, np.nan)
-    for k in np.flatnonzero(poses.known):
-        R, covariance = poses.R_local_camera[k], marginals.marginalCovariance(int(k))
+    for k in np.flatnonzero(poses.known).tolist():
+        R, covariance = poses.R_local_camera[k], marginals.marginalCovariance(k)
         position[k] = np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T))
         tilt[k] = np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)
+    if navigation is not None:  # roll and pitch err by a bias too, which no number of images averages down
+        tilt = np.hypot(tilt, navigation.sigma_attitude[:, :2].mean(1))
     return position, tilt
 
 

@@ -128,15 +128,15 @@ def _slopes_before_port(port: Port, X: Array) -> Array:
     return azimuth * tangent[:, None]
 
 
-def normalised(camera: Camera, uv: Array, range_m: float = 3.0) -> Array:
-    """Slopes (N, 2) X/Z, Y/Z of the point that each pixel (N, 2) sees at depth Z = range_m.
+def normalised(camera: Camera, uv: Array, range_m: float | Array = 3.0) -> Array:
+    """Slopes (N, 2) X/Z, Y/Z of the point that each pixel (N, 2) sees at depth Z = range_m, one or (N,).
 
     Exact at every depth for a camera with one centre of projection; for a flat port, whose rays do not meet in
     one point, exact at that depth only.
     """
     origin, direction = rays(camera, uv)
     step = (range_m - origin[:, 2]) / direction[:, 2]
-    return (origin[:, :2] + step[:, None] * direction[:, :2]) / range_m
+    return (origin[:, :2] + step[:, None] * direction[:, :2]) / np.reshape(range_m, (-1, 1))
 
 
 def ground_sample_distance(camera: Camera, range_m: float) -> float:

@@ -106,10 +106,10 @@ def _motion(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
     near = everything if pair.poses is None else _candidates(job, pair, pair.poses, a, b, at)
     matched = _matches(job, a, b, near)
     soundings = _soundings(a, carried[0]), _soundings(b, carried[1])
-    found, turned = _estimate(job, pair.prior, *matched, soundings, at), (False, False)
+    found, turned = _estimate(job, pair.prior, matched, soundings, at), (False, False)
     if pair.prior is not None and _weak(found, matched):
         found, matched, turned = _with_half_turns(job, pair.prior, a, b, (found, matched), soundings, at)
-    count = len(matched[0])
+    count = len(matched.features)
     if found is None:
         return Made({}, {"model": "", "matches": count, "inliers": 0})
     return Made(
@@ -117,8 +117,9 @@ def _motion(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
             "R": found.R_i_j,
             "t": found.t_i_j,
             "covariance": found.covariance,
-            "uv_i": matched[0][found.inliers].astype(np.float32),
-            "uv_j": matched[1][found.inliers].astype(np.float32),
+            "uv_i": matched.uv_i[found.inliers].astype(np.float32),
+            "uv_j": matched.uv_j[found.inliers].astype(np.float32),
+            "features": matched.features[found.inliers].astype(np.int32),
         },
         {
             "model": found.model,
@@ -131,26 +132,29 @@ def _motion(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
     )
 
 
-Matched = tuple[np.ndarray, np.ndarray]
+class Matched(NamedTuple):
+    """Matched features: pixels uv_i, uv_j (M, 2) and the features' numbers (M, 2) in either image."""
+
+    uv_i: np.ndarray
+    uv_j: np.ndarray
+    features: np.ndarray
 
 
 def _matches(job: Job, a: Entry, b: Entry, index: tuple[np.ndarray, ...]) -> Matched:
-    """Pixels (M, 2), (M, 2) of matched features, of those that index names in either image."""
+    """Matches of the features that index names in either image."""
     of_a, of_b = (entry.arrays["feature_descriptors"][chosen] for entry, chosen in zip((a, b), index, strict=True))
     matches = features.match(of_a, of_b, job.parameters.match.ratio)
-    uv_a, uv_b = (
-        entry.arrays["feature_uv"][chosen[column]].astype(float)
-        for entry, chosen, column in zip((a, b), index, matches.T, strict=True)
-    )
-    return uv_a, uv_b
+    numbers = np.column_stack([index[0][matches[:, 0]], index[1][matches[:, 1]]])
+    uv_a, uv_b = (entry.arrays["feature_uv"][n].astype(float) for entry, n in zip((a, b), numbers.T, strict=True))
+    return Matched(uv_a, uv_b, numbers)
 
 
 def _estimate(
-    job: Job, prior: RelativePrior | None, uv_a: np.ndarray, uv_b: np.ndarray, soundings: Soundings, range_m: float
+    job: Job, prior: RelativePrior | None, matched: Matched, soundings: Soundings, range_m: float
 ) -> motion.Motion | None:
     lens = job.calibration.camera
     focal_px = range_m / camera.ground_sample_distance(lens, range_m)
-    slopes = camera.normalised(lens, uv_a, range_m), camera.normalised(lens, uv_b, range_m)
+    slopes = camera.normalised(lens, matched.uv_i, range_m), camera.normalised(lens, matched.uv_j, range_m)
     (X_a, sigma_a), (X_b, sigma_b) = soundings
     shared = max(sigma_a, sigma_b) / range_m
     return motion.estimate(*slopes, X_a, X_b, focal_px, job.parameters.match, prior, shared)
@@ -158,7 +162,7 @@ def _estimate(
 
 def _weak(found: motion.Motion | None, matched: Matched) -> bool:
     """Whether most matches disagree with what navigation lets them say."""
-    return found is None or len(found.inliers) < 0.5 * len(matched[0])
+    return found is None or len(found.inliers) < 0.5 * len(matched.features)
 
 
 def _with_half_turns(
@@ -175,15 +179,15 @@ def _with_half_turns(
     Believed only when twice as many matches agree to it, and twice as many as make a pair.
     """
     best, matched = so_far
-    uv = _matches(job, a, b, tuple(np.arange(len(entry.arrays["feature_uv"])) for entry in (a, b)))
+    every = _matches(job, a, b, tuple(np.arange(len(entry.arrays["feature_uv"])) for entry in (a, b)))
     needed = 2 * max(len(best.inliers) if best else 0, job.parameters.match.min_inliers)
     found = best, matched, (False, False)
-    if len(uv[0]) < needed:
+    if len(every.features) < needed:
         return found
     for turned in _HALF_TURNS:
-        other = _estimate(job, with_half_turn(prior, *turned), *uv, soundings, range_m)
+        other = _estimate(job, with_half_turn(prior, *turned), every, soundings, range_m)
         if other is not None and len(other.inliers) > needed:
-            needed, found = len(other.inliers), (other, uv, turned)
+            needed, found = len(other.inliers), (other, every, turned)
     return found
 
 

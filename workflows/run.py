@@ -1,5 +1,6 @@
 """The main job: a mission folder to maps. Images, then pairs, then poses, then map tiles, then the products."""
 
+import itertools
 import json
 import os
 from collections.abc import Sequence
@@ -111,7 +112,7 @@ def _poses(state: Session) -> Posed:
     ]
     batch_of = {image.row: k // _IMAGES_A_BATCH for k, image in enumerate(made.images)}
     matches = _match_tasks(state, wanted, extracts, batch_of, "match")
-    last = _adjust_task(state, matches, "adjust")
+    last = _adjust_task(state, matches, extracts, "adjust")
     *parts, adjusted = compute(state, "poses", [*extracts, *matches, last])
     extracted = _by_row(made, parts[: len(extracts)])
     matched = [pair for part in parts[len(extracts) :] for pair in part]
@@ -142,7 +143,7 @@ def _close_loops(
             break
         tasks = _match_tasks(state, wanted, extracts, batch_of, f"match-{turn}")
         matched = matched + [pair for part in compute(state, "loops", tasks) for pair in part]
-        (adjusted,) = compute(state, "adjust", [_adjust_task(state, [matched], f"adjust-{turn}")])
+        (adjusted,) = compute(state, "adjust", [_adjust_task(state, [matched], extracts, f"adjust-{turn}")])
     return matched, adjusted
 
 
@@ -170,13 +171,18 @@ def _match_batch(job: Job, batch: Sequence[match.PairTask], rows: list[list[int]
     return match.match_batch(job, batch, by_row)
 
 
-def _adjust_task(state: Session, matches: Sequence[Any], name: str) -> Delayed:
-    count = state.opened.frames.sizes["image"]
-    return delayed(_adjust)(state.job, count, list(matches), state.plan.prior, state.plan.R_first, dask_key_name=name)
+def _adjust_task(state: Session, matches: Sequence[Any], extracts: Sequence[Any], name: str) -> Delayed:
+    count, made = state.opened.frames.sizes["image"], state.plan
+    rows = [image.row for image in made.images]
+    given = (count, rows, list(matches), list(extracts), made.prior, made.R_first)
+    return delayed(_adjust)(state.job, *given, dask_key_name=name)
 
 
-def _adjust(job: Job, count: int, parts: list, prior: Any, R_first: np.ndarray) -> Done:
-    return solve.adjust_all(job, count, [pair for part in parts for pair in part], prior, R_first)
+def _adjust(
+    job: Job, count: int, rows: list[int], matched: list, extracted: list, prior: Any, R_first: np.ndarray
+) -> Done:
+    by_row = dict(zip(rows, itertools.chain.from_iterable(extracted), strict=True))
+    return solve.adjust_all(job, count, list(itertools.chain.from_iterable(matched)), by_row, prior, R_first)
 
 
 def _solution(job: Job, done: Done) -> solve.Solution:

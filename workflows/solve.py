@@ -1,15 +1,16 @@
 """Once per mission: all poses from the pair motions and navigation."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ..catalog.store import Entry
-from ..tasks import adjust
+from ..tasks import adjust, bundle, tracks
+from ..tasks.adjust import Adjusted
 from ..tasks.navigation import NavigationPrior, Poses
-from . import match
+from . import extract, match
 from .job import Done, Job, Made, array_digest, code_version, load, once, stage
 
 STEP = "adjust"
@@ -34,31 +35,64 @@ class Solution(NamedTuple):
 
 
 def adjust_all(
-    job: Job, count: int, matched: Sequence[tuple[int, int, Done]], prior: NavigationPrior | None, R_first: np.ndarray
+    job: Job,
+    count: int,
+    matched: Sequence[tuple[int, int, Done]],
+    extracted: Mapping[int, Done],
+    prior: NavigationPrior | None,
+    R_first: np.ndarray,
 ) -> Done:
-    """Adjust `count` images; matched are the results of `match`."""
+    """Adjust `count` images: the pair motions and navigation first, then the tie points with the laser's ranges.
+
+    matched, extracted : results of `match` and, by row, of `extract`.
+    """
     linked = [(i, j, done) for i, j, done in matched if done.info["model"]]
     inputs = [f"{i}-{j}:{done.key}" for i, j, done in linked]
+    lit = {row: done for row, done in extracted.items() if done.info["soundings"]}
+    inputs += [f"{row}:{done.key}" for row, done in sorted(lit.items())]
     if prior is not None:
         measured = (prior.time_s, prior.sigma_horizontal, prior.sigma_depth, prior.sigma_attitude)
         inputs.append(array_digest(*prior.poses, *measured))
     inputs.append(array_digest(R_first))
+    parameters = stage(job.calibration.camera, job.parameters.adjust)
 
     def make() -> Made:
         links = [match.link(i, j, load(job, match.STEP, done.key)) for i, j, done in linked]
-        found = adjust.adjust(count, links, prior, R_first, job.parameters.adjust)
-        used = np.array([[link.i, link.j] for link, ok in zip(links, found.used, strict=True) if ok], int)
+        chained = adjust.adjust(count, links, prior, R_first, job.parameters.adjust)
+        used = [pair for pair, ok in zip(linked, chained.used, strict=True) if ok]
+        found = _bundle(job, chained, used, lit, prior)
         arrays = {
             "R": found.poses.R_local_camera,
             "C": found.poses.C_local,
             "sigma_m": found.sigma_m,
             "sigma_tilt_rad": found.sigma_tilt_rad,
-            "pairs": used.reshape(-1, 2),
+            "pairs": np.array([[i, j] for i, j, _ in used], int).reshape(-1, 2),
             "turned": found.turned,
         }
         return Made(arrays, {"status": found.status})
 
-    return once(job, STEP, VERSION, [str(count), *inputs], stage(job.parameters.adjust), make)
+    return once(job, STEP, VERSION, [str(count), *inputs], parameters, make)
+
+
+def _bundle(
+    job: Job,
+    chained: Adjusted,
+    used: Sequence[tuple[int, int, Done]],
+    lit: Mapping[int, Done],
+    prior: NavigationPrior | None,
+) -> Adjusted:
+    camera, p = job.calibration.camera, job.parameters.adjust
+    sights = tracks.thin(_sights(job, used), (camera.height, camera.width), p.tie_cells, p.tie_points_per_cell)
+    soundings = {row: load(job, extract.STEP, done.key).arrays["laser_X"] for row, done in lit.items()}
+    return bundle.adjust(camera, chained, sights, soundings, prior, p)
+
+
+def _sights(job: Job, used: Sequence[tuple[int, int, Done]]) -> tracks.Sights:
+    matches = []
+    for i, j, done in used:
+        arrays = load(job, match.STEP, done.key).arrays
+        matches.append(tracks.PairMatches(i, j, arrays["features"], arrays["uv_i"], arrays["uv_j"]))
+    return tracks.join(matches)
 
 
 def solution(entry: Entry) -> Solution:

@@ -8,11 +8,15 @@ FOCAL_PX = 1500.0
 DOWN = np.diag([1.0, -1.0, -1.0])
 
 
+def height(relief_m, x, y):
+    """Elevation of a seabed 3 m below z = 0 with long waves of a relief."""
+    return -3 + relief_m * (np.sin(2.1 * x) * np.cos(1.7 * y) + 0.5 * np.sin(4.3 * y + x))
+
+
 def seabed(relief_m, seed=0, size_m=12.0, count=40_000):
     """Points (N, 3) on a seabed 3 m below z = 0 with long waves of a relief."""
     xy = np.random.default_rng(seed).uniform(-size_m / 2, size_m / 2, (count, 2))
-    z = -3 + relief_m * (np.sin(2.1 * xy[:, 0]) * np.cos(1.7 * xy[:, 1]) + 0.5 * np.sin(4.3 * xy[:, 1] + xy[:, 0]))
-    return np.column_stack([xy, z])
+    return np.column_stack([xy, height(relief_m, *xy.T)])
 
 
 def cameras(C, tilt_deg=2.0, seed=1):
@@ -51,3 +55,16 @@ def true_motion(poses, i, j):
     """R_i_j, t_i_j."""
     R_i = poses.R_local_camera[i]
     return R_i.T @ poses.R_local_camera[j], R_i.T @ (poses.C_local[j] - poses.C_local[i])
+
+
+def cross(relief_m, poses, k, rng, noise_m=0.001, count=300):
+    """Soundings (2 count, 3) in the frame of camera k, evenly along two diagonals of its image."""
+    t = np.linspace(-0.3, 0.3, count)
+    x = np.concatenate([np.column_stack([t, t]), np.column_stack([t, -t])])
+    ray = np.column_stack([x, np.ones(len(x))])
+    direction, C = ray @ poses.R_local_camera[k].T, poses.C_local[k]
+    Z = np.full(len(x), 3.0)
+    for _ in range(30):
+        ground = C + direction * Z[:, None]
+        Z += (height(relief_m, *ground[:, :2].T) - ground[:, 2]) / direction[:, 2]
+    return ray * (Z + rng.normal(0, noise_m, len(Z)))[:, None]

@@ -1,0 +1,234 @@
+"""Bundle adjustment: tie points, laser ranges and navigation in one estimate of all poses, solved by GTSAM.
+
+The paper names it as its future (VI). Tie points hold the images to each other, the laser gives the scale wherever it
+passes near a tie point, navigation holds the map to the ground. The noise of the sights and the roughness of the
+terrain between soundings are measured on what the rounds before leave of them.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.calibration import Camera
+from ..schemas.parameters import AdjustParameters
+from . import laser_ranges
+from .adjust import Adjusted, sigmas
+from .camera import ground_sample_distance, normalised
+from .factors import datum, first_values, navigation_factors
+from .laser_ranges import Ranges
+from .navigation import NavigationPrior, Poses, with_half_turns
+from .tracks import Sights
+
+Array = NDArray[Any]
+
+_FIRST_SIGMA_PX, _SIGMA_PX = 0.7, (0.1, 2.0)
+_LEAST_PARALLAX = 0.015  # radians
+# before each round, what is farther off is a wrong match: pixels, but not less than sigmas
+_GATES_PX, _GATE_SIGMAS = (100.0, 10.0, 1.0, 0.5), 5.0
+_COVARIANCE_SIGMA_PX = 1.0  # of sights, for the covariances: what calibration leaves is shared by many
+_RANGE_GATE = 6.0  # sigmas
+# The errors of ranges beside each other are alike. Sights hold an image against that; one that has none, as laser
+# images have, would slide down the slopes of such errors, so its ranges count as if they were so many times worse.
+_BLIND = 5.0
+_RANGE_STEP = 1.1  # ratio of neighbouring sigmas that have a noise model of their own
+_MAD_TO_SIGMA = 1.4826
+
+
+class Block(NamedTuple):
+    """What is adjusted together.
+
+    Attributes
+    ----------
+    sights : of tie points, wrong matches left out. x : (M, 2) their slopes.
+    X : (N, 3) tie points, local. focal_px : pixels a slope.
+    ranges : of the laser. roughness : see `laser_ranges`.
+    """
+
+    sights: Sights
+    x: Array
+    X: Array
+    focal_px: float
+    ranges: Ranges
+    roughness: float
+
+
+class Bundle(NamedTuple):
+    """The adjusted block.
+
+    Attributes
+    ----------
+    poses : cameras, local. block : tie points and what was measured of them.
+    residual_px : (M, 2) of the sights. sigma_px : their noise.
+    """
+
+    poses: Poses
+    block: Block
+    residual_px: Array
+    sigma_px: float
+
+
+def adjust(
+    camera: Camera,
+    chained: Adjusted,
+    sights: Sights,
+    soundings: Mapping[int, Array],
+    navigation: NavigationPrior | None,
+    p: AdjustParameters,
+) -> Adjusted:
+    """The poses of `tasks.adjust.adjust` made better by tie points and laser ranges, with their sigmas.
+
+    sights : tie points of the links that `chained` used. soundings : (L, 3) of images with a laser, camera frame.
+    """
+    if navigation is not None:
+        navigation = with_half_turns(navigation, chained.turned)
+    found = refine(camera, chained.poses, sights, soundings, navigation, p)
+    if found is None:
+        return chained
+    graph, values = _graph(found.poses, found.block, _COVARIANCE_SIGMA_PX, navigation, p)
+    sigma_m, sigma_tilt = sigmas(graph, values, found.poses, navigation)
+    return chained._replace(poses=found.poses, sigma_m=sigma_m, sigma_tilt_rad=sigma_tilt)
+
+
+def refine(
+    camera: Camera,
+    start: Poses,
+    sights: Sights,
+    soundings: Mapping[int, Array],
+    navigation: NavigationPrior | None,
+    p: AdjustParameters,
+) -> Bundle | None:
+    """The poses that have a start, adjusted together; None where images see no tie point in common.
+
+    soundings : (L, 3) of each image with a laser, camera frame.
+    """
+    lit = {k: own for k, own in soundings.items() if start.known[k] and len(own)}
+    depth = float(np.median([np.median(own[:, 2]) for own in lit.values()])) if lit else 3.0
+    sights = sights.take(start.known[sights.image])
+    bundle, poses = None, start
+    sigma_px, rough = _FIRST_SIGMA_PX, laser_ranges.FIRST_ROUGHNESS
+    for gate_px in _GATES_PX:
+        gate_px = max(gate_px, _GATE_SIGMAS * sigma_px)
+        sights, x, X, focal_px = _inliers(camera, poses, sights, depth, gate_px)
+        if not len(X):
+            return None
+        ranges = _believable(poses, X, laser_ranges.measure(poses, X, lit, p.max_ranges), rough)
+        graph, values = _graph(poses, Block(sights, x, X, focal_px, ranges, rough), sigma_px, navigation, p)
+        values = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
+        poses, X = _read(values, poses, len(X))
+        residual_px = residuals(poses, sights, x, X) * focal_px
+        sigma_px, rough = _noise_px(residual_px, len(X)), laser_ranges.roughness(poses, X, ranges)
+        bundle = Bundle(poses, Block(sights, x, X, focal_px, ranges, rough), residual_px, sigma_px)
+    return bundle
+
+
+def _graph(
+    poses: Poses, block: Block, sigma_px: float, navigation: NavigationPrior | None, p: AdjustParameters
+) -> tuple[Any, Any]:
+    """GTSAM's graph and the values to start from."""
+    first = int(np.flatnonzero(poses.known)[0])
+    graph = navigation_factors(navigation) if navigation else datum(poses, first)
+    values = first_values(graph, poses)
+    _add_sights(graph, values, block.sights, block.x, block.X, sigma_px / block.focal_px, p.robust_threshold)
+    sigma_m = laser_ranges.sigma(block.ranges.away_m, block.roughness)
+    blind = ~np.isin(block.ranges.image, block.sights.image)
+    _add_ranges(graph, block.ranges, np.where(blind, _BLIND * sigma_m, sigma_m), p.robust_threshold)
+    return graph, values
+
+
+def _inliers(camera: Camera, poses: Poses, sights: Sights, depth: float, gate_px: float):
+    """Sights that agree, their slopes x (M, 2), the tie points X (N, 3), and the focal length in pixels."""
+    focal_px = depth / ground_sample_distance(camera, depth)
+    x = normalised(camera, sights.uv, depth)
+    X, parallax = intersect(poses, sights, x)
+    if camera.port is not None:  # its slopes hold at one depth only
+        Z = in_cameras(poses, sights, X)[:, 2]
+        x = normalised(camera, sights.uv, np.where(Z > 0, Z, depth))
+        X, parallax = intersect(poses, sights, x)
+    off = np.linalg.norm(residuals(poses, sights, x, X), axis=1) * focal_px
+    good = (off < gate_px) & (parallax > _LEAST_PARALLAX)[sights.track]
+    kept = sights.kept(good)
+    sights, x = sights.take(good), x[kept]
+    return sights, x, intersect(poses, sights, x)[0], focal_px
+
+
+def in_cameras(poses: Poses, sights: Sights, X: Array) -> Array:
+    """The tie points (M, 3) in the frames of the cameras that see them."""
+    off = X[sights.track] - poses.C_local[sights.image]
+    return np.einsum("mji,mj->mi", poses.R_local_camera[sights.image], off)
+
+
+def residuals(poses: Poses, sights: Sights, x: Array, X: Array) -> Array:
+    """Where tie points X (N, 3) should be seen less where they are (M, 2), slopes; inf behind the camera."""
+    seen = in_cameras(poses, sights, X)
+    front = seen[:, 2:] > 0
+    return np.where(front, seen[:, :2] / np.where(front, seen[:, 2:], 1.0) - x, np.inf)
+
+
+def intersect(poses: Poses, sights: Sights, x: Array) -> tuple[Array, Array]:
+    """Points (N, 3) nearest to the rays of each tie point, and the angle (N,) by which these rays differ, radians."""
+    count = sights.tie_points
+    ray = np.einsum("mij,mj->mi", poses.R_local_camera[sights.image], np.column_stack([x, np.ones(len(x))]))
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    along = np.einsum("mij,mj->mi", across, poses.C_local[sights.image])
+    starts = np.searchsorted(sights.track, np.arange(count))
+    A, b = (np.add.reduceat(values, starts) if count else values[:0] for values in (across, along))
+    size = np.bincount(sights.track, minlength=count)
+    weakest = np.linalg.eigvalsh(A)[:, 0] if count else np.zeros(0)
+    X = np.linalg.solve(A + 1e-12 * np.eye(3), b[..., None])[..., 0] if count else np.zeros((0, 3))
+    return X, 2 * np.sqrt(np.maximum(weakest, 0) / np.maximum(size, 1))
+
+
+def _believable(poses: Poses, X: Array, ranges: Ranges, rough: float) -> Ranges:
+    """Ranges without those that only a step in the terrain can explain."""
+    left = np.linalg.norm(X[ranges.track] - poses.C_local[ranges.image], axis=1) - ranges.range_m
+    level = np.median(left) if len(left) else 0.0  # what all have in common is the scale that they are to tell
+    keep = np.abs(left - level) < _RANGE_GATE * laser_ranges.sigma(ranges.away_m, rough)
+    return Ranges(*(values[keep] for values in ranges))
+
+
+def _tie_point(number: int) -> int:
+    return gtsam.symbol("x", number)
+
+
+def _robust(noise: Any, threshold: float) -> Any:
+    """Cauchy's kernel at twice the threshold of pair motions: a wrong match must not pull, however many it has."""
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(2 * threshold), noise)
+
+
+def _add_sights(graph: Any, values: Any, sights: Sights, x: Array, X: Array, sigma: float, threshold: float) -> None:
+    noise, pinhole = _robust(gtsam.noiseModel.Isotropic.Sigma(2, sigma), threshold), gtsam.Cal3_S2()
+    for number, point in enumerate(X):
+        values.insert(_tie_point(number), point)
+    for image, track, seen in zip(sights.image.tolist(), sights.track.tolist(), x, strict=True):
+        graph.add(gtsam.GenericProjectionFactorCal3_S2(seen, noise, image, _tie_point(track), pinhole))
+
+
+def _add_ranges(graph: Any, ranges: Ranges, sigma: Array, threshold: float) -> None:
+    level = np.round(np.log(sigma) / np.log(_RANGE_STEP)).astype(int)
+    noises = {
+        k: _robust(gtsam.noiseModel.Isotropic.Sigma(1, float(_RANGE_STEP**k)), threshold)
+        for k in np.unique(level).tolist()
+    }
+    columns = (ranges.image.tolist(), ranges.track.tolist(), ranges.range_m.tolist(), level.tolist())
+    for image, track, range_m, k in zip(*columns, strict=True):
+        graph.add(gtsam.RangeFactor3D(image, _tie_point(track), range_m, noises[k]))
+
+
+def _noise_px(residual_px: Array, points: int) -> float:
+    """1-sigma of a sight along either axis, from the residuals that the adjustment left."""
+    freedom = max(0.2, 1 - 3 * points / max(1, residual_px.size))
+    spread = _MAD_TO_SIGMA * float(np.median(np.abs(residual_px))) / np.sqrt(freedom)
+    return float(np.clip(spread, *_SIGMA_PX))
+
+
+def _read(values: Any, poses: Poses, points: int) -> tuple[Poses, Array]:
+    R, C = poses.R_local_camera.copy(), poses.C_local.copy()
+    for k in np.flatnonzero(poses.known).tolist():
+        found = values.atPose3(k)
+        R[k], C[k] = found.rotation().matrix(), found.translation()
+    X = np.array([values.atPoint3(_tie_point(n)) for n in range(points)]).reshape(-1, 3)
+    return Poses(R, C), X

@@ -1,0 +1,137 @@
+"""Bundle adjustment of a made survey: better than what it starts from, honest about itself, hard to mislead."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from seamosaic.schemas.calibration import Camera, Port
+from seamosaic.schemas.parameters import AdjustParameters
+from seamosaic.tasks import bundle, tracks
+from seamosaic.tasks.adjust import Adjusted
+from seamosaic.tasks.camera import project
+from seamosaic.tasks.navigation import NavigationPrior, Poses
+from seamosaic.tasks.rotations import R_vehicle_camera, nearest_rotation
+from seamosaic.tasks.tracks import PairMatches
+
+from tests.tasks import scenes
+
+LENS = Camera(model="brown", width=1216, height=912, fx=1500, fy=1500, cx=607.5, cy=455.5)
+WINDOW = LENS.model_copy(
+    update={"model": "flat-port", "fx": 1120.0, "fy": 1120.0, "port": Port(distance=0.04, thickness=0.01)}
+)
+P = AdjustParameters()
+
+
+def _survey():
+    x, y = np.meshgrid(np.arange(3) * 1.2, np.arange(6) * 0.8)
+    y[:, 1] = y[::-1, 1]
+    return scenes.cameras(np.column_stack([x.T.ravel(), y.T.ravel(), np.zeros(18)]) - [1.2, 2, 0], tilt_deg=1.5)
+
+
+def _matches(lens, points, poses, rng, wrong=0.0, noise_px=0.3):
+    """Pairs of matches between neighbouring images; every point is one feature."""
+    seen = []
+    for R, C in zip(*poses, strict=True):
+        uv = project(lens, (points - C) @ R)
+        inside = ((uv > 0) & (uv < [lens.width - 1, lens.height - 1])).all(1)
+        seen.append((uv + rng.normal(0, noise_px, uv.shape), inside))
+    pairs = []
+    for i in range(len(seen)):
+        for j in range(i + 1, len(seen)):
+            both = np.flatnonzero(seen[i][1] & seen[j][1])
+            if len(both) > 20:
+                uv_j = seen[j][0][both].copy()
+                bad = rng.random(len(both)) < wrong
+                uv_j[bad] += rng.normal(0, 20, (bad.sum(), 2))
+                number_j = np.where(bad, both + 10_000 * (1 + i), both)
+                pairs.append(PairMatches(i, j, np.column_stack([both, number_j]), seen[i][0][both], uv_j))
+    return pairs
+
+
+def _navigation(poses, rng):
+    count = len(poses.C_local)
+    noise = np.column_stack([np.cumsum(rng.normal(0, 0.03, (count, 2)), 0), rng.normal(0, 0.03, count)])
+    turned = Rotation.from_rotvec(np.radians(rng.normal(0, 0.2, (count, 3)))).as_matrix()
+    return NavigationPrior(
+        Poses(poses.R_local_camera @ turned, poses.C_local + noise + [0.3, -0.2, 0.02]),
+        4.0 * np.arange(count),
+        np.full(count, 0.4),
+        np.full(count, 0.03),
+        np.radians(np.tile([0.3, 0.3, 0.8], (count, 1))),
+        0.02,
+        R_vehicle_camera(0, 0, 0).T,
+    )
+
+
+def _chained(start):
+    count = len(start.C_local)
+    sigma = np.full((count, 3), 1.0)
+    return Adjusted(start, sigma, sigma[:, 0], ["adjusted"] * count, np.ones(0, bool), np.zeros(count, bool))
+
+
+def _rms(found, true):
+    a, b = found - found.mean(0), true - true.mean(0)
+    return float(np.sqrt(((a @ nearest_rotation(b.T @ a).T - b) ** 2).sum(1).mean()))
+
+
+def _run(lens=LENS, wrong=0.0, laser=True, seed=0):
+    rng, poses, points = np.random.default_rng(seed), _survey(), scenes.seabed(0.15, count=20_000)
+    navigation = _navigation(poses, rng)
+    sights = tracks.thin(tracks.join(_matches(lens, points, poses, rng, wrong)), (912, 1216), P.tie_cells, 2)
+    soundings = {k: scenes.cross(0.15, poses, k, rng) for k in range(18)} if laser else {}
+    found = bundle.adjust(lens, _chained(navigation.poses), sights, soundings, navigation, P)
+    return poses, navigation, found
+
+
+@pytest.mark.parametrize(("lens", "wrong"), [(LENS, 0.0), (LENS, 0.1), (WINDOW, 0.0)])
+def test_tie_points_and_laser_hold_a_survey_to_the_millimetre(lens, wrong):
+    poses, navigation, found = _run(lens, wrong)
+    assert _rms(navigation.poses.C_local, poses.C_local) > 0.03
+    assert 2e-4 < _rms(found.poses.C_local, poses.C_local) < 0.004
+    size = [np.linalg.norm(C - C.mean(0)) for C in (found.poses.C_local, poses.C_local)]
+    assert 0 < abs(size[0] / size[1] - 1) < 1e-3
+
+
+def test_the_laser_gives_the_scale():
+    scale = []
+    for laser in (True, False):
+        poses, _, found = _run(laser=laser, seed=3)
+        size = [np.linalg.norm(C - C.mean(0)) for C in (found.poses.C_local, poses.C_local)]
+        scale.append(abs(size[0] / size[1] - 1))
+    assert scale[0] < 1e-3 < scale[1] < 0.05
+
+
+def test_the_stated_sigmas_are_those_of_navigation_shared_by_all():
+    poses, _, found = _run(seed=1)
+    z = (found.poses.C_local - poses.C_local) / found.sigma_m
+    assert (np.abs(z) < 3).all()
+    assert (found.sigma_m[:, :2] > 0.1).all()
+    assert (found.sigma_m[:, :2] < 0.5).all()
+    assert (found.sigma_m[:, 2] > 0.02).all()
+    assert (found.sigma_m[:, 2] < 0.05).all()
+
+
+def test_wrong_matches_are_left_out_and_the_noise_is_measured():
+    rng, poses, points = np.random.default_rng(2), _survey(), scenes.seabed(0.15, count=20_000)
+    sights = tracks.join(_matches(LENS, points, poses, rng, wrong=0.1))
+    found = bundle.refine(LENS, poses, sights, {}, _navigation(poses, rng), P)
+    assert 0.15 < found.sigma_px < 0.36
+    left = found.block.sights.image.size / sights.image.size
+    assert 0.6 < left < 0.99
+    assert np.abs(found.residual_px).max() < 3
+
+
+def test_without_tie_points_the_start_stands():
+    poses = _survey()
+    start = _chained(poses)
+    assert bundle.adjust(LENS, start, tracks.join([]), {}, None, P) is start
+
+
+def test_without_navigation_the_first_image_is_the_datum():
+    rng, poses, points = np.random.default_rng(4), _survey(), scenes.seabed(0.15, count=20_000)
+    moved = Poses(poses.R_local_camera, poses.C_local + rng.normal(0, 0.01, poses.C_local.shape))
+    sights = tracks.join(_matches(LENS, points, poses, rng))
+    soundings = {k: scenes.cross(0.15, poses, k, rng) for k in range(18)}
+    found = bundle.adjust(LENS, _chained(moved), sights, soundings, None, P)
+    np.testing.assert_allclose(found.poses.C_local[0], moved.C_local[0], atol=1e-4)
+    assert 1e-4 < _rms(found.poses.C_local, poses.C_local) < 0.004
+    assert found.sigma_m[0].max() < 1e-4 < found.sigma_m[-1].max() < 0.02
