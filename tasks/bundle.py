@@ -32,7 +32,7 @@ _COVARIANCE_SIGMA_PX = 1.0  # of sights, for the covariances: what calibration l
 _RANGE_GATE = 6.0  # sigmas
 # The errors of ranges beside each other are alike. Sights hold an image against that; one that has none, as laser
 # images have, would slide down the slopes of such errors, so its ranges count as if they were so many times worse.
-_BLIND = 5.0
+_BLIND = 20.0
 _RANGE_STEP = 1.1  # ratio of neighbouring sigmas that have a noise model of their own
 _MAD_TO_SIGMA = 1.4826
 
