@@ -66,8 +66,8 @@ class BoardResult(NamedTuple):
     corner_residual_px : (P, 2). corner_used : (P,).
     laser_residual_m : (L,) distance of the light on the board from the sheet, along the sheet's normal.
     laser_used : (L,). corner_sigma_px, laser_sigma : measured 1-sigma (pixels; stated sigmas).
-    left_out_m : (n, S) rms distance from the board of points triangulated by sheets fitted to the other images.
-    left_out_sheets : (n, S, 4) those sheets. range_m : (n,) median range of the light.
+    left_out_m : (n, S) rms distance from the board (by its corners alone) of an image's light, triangulated by an
+        adjustment without it. left_out_sheets : (n, S, 4) its sheets. range_m : (n,) median range of the light.
     """
 
     camera: Camera
@@ -326,8 +326,7 @@ def _result(x: Array, solved: Solved, p: _Problem, corner_used: NDArray, laser_u
     corner, _ = _misfits(x, p)
     light = _on_board(camera, poses, p.data)
     size = len(p.names) + 3 * len(p.starts)
-    kept = _chosen(p, corner_used, laser_used).data
-    left_out = _left_out_sheets(light[laser_used], kept, len(p.starts))
+    left_out, left_out_m = _left_out(x, p, corner_used, laser_used)
     steps = x[len(p.names) : size]
     covariance = solved.covariance[:size, :size]
     wide = _widened(covariance, left_out, sheets, p.starts, len(p.names))
@@ -347,33 +346,40 @@ def _result(x: Array, solved: Solved, p: _Problem, corner_used: NDArray, laser_u
         laser_used=laser_used,
         corner_sigma_px=p.corner_sigma,
         laser_sigma=p.laser_sigma,
-        left_out_m=_left_out_distance(camera, left_out, _board_planes(poses), kept),
+        left_out_m=left_out_m,
         left_out_sheets=left_out,
         range_m=np.array([float(np.median(np.linalg.norm(X, axis=1))) if len(X) else np.nan for X in ranges]),
     )
 
 
-def _left_out_sheets(light: Array, data: BoardData, count: int) -> Array:
-    """Sheets (n, S, 4) fitted to the light of all other images; NaN where too little is left."""
-    sheets = np.full((data.images, count, 4), np.nan)
-    for k in range(data.images):
+def _without(x: Array, p: _Problem, corner: NDArray, laser: NDArray, image: int) -> tuple[Camera, Array, Array]:
+    """Camera, sheets and poses of an adjustment that knows nothing of the light in one image."""
+    chosen = _chosen(p, corner, laser & (p.data.laser_image != image))
+    solved = solve(lambda y: _residuals(y, chosen), x, _layout(chosen), _rows(chosen))
+    return _unpacked(solved.x, chosen)
+
+
+def _left_out(x: Array, p: _Problem, corner: NDArray, laser: NDArray) -> tuple[Array, Array]:
+    """Sheets (n, S, 4) without the light of each image, and what they are off by on it (n, S).
+
+    The latter is the rms distance, metres, along the board's normal, of the image's light, triangulated with these
+    sheets, from the board as its corners alone have it. NaN where too little is left to tell.
+    """
+    count, lit = len(p.starts), p.data.laser_image
+    sheets, rms = np.full((p.data.images, count, 4), np.nan), np.full((p.data.images, count), np.nan)
+    for k in np.unique(lit[laser]):
+        camera, others, poses = _without(x, p, corner, laser, int(k))
+        board = _board_planes(poses)[k]
         for s in range(count):
-            own = (data.laser_sheet == s) & (data.laser_image != k)
-            if len(np.unique(data.laser_image[own])) >= 2:
-                sheets[k, s] = fit_sheet(light[own])
-    return sheets
-
-
-def _left_out_distance(camera: Camera, sheets: Array, boards: Array, data: BoardData) -> Array:
-    """Rms (n, S), metres, along the board's normal, of each image's light triangulated without it."""
-    rms = np.full(sheets.shape[:2], np.nan)
-    for k, s in np.ndindex(*sheets.shape[:2]):
-        own = (data.laser_sheet == s) & (data.laser_image == k)
-        if own.any() and np.isfinite(sheets[k, s]).all():
-            origin, direction = rays(camera, data.laser_uv[own])
-            X = cast_rays(origin, direction, sheets[k, s])
-            rms[k, s] = float(np.sqrt(np.mean((X @ boards[k, :3] - boards[k, 3]) ** 2)))
-    return rms
+            own = laser & (p.data.laser_sheet == s)
+            if len(np.unique(lit[own & (lit != k)])) < 2:
+                continue
+            sheets[k, s] = others[s]
+            here = own & (lit == k)
+            if here.any():
+                X = cast_rays(*rays(camera, p.data.laser_uv[here]), others[s])
+                rms[k, s] = float(np.sqrt(np.mean((X @ board[:3] - board[3]) ** 2)))
+    return sheets, rms
 
 
 def _widened(covariance: Array, left_out: Array, sheets: Array, starts: Sequence[SheetBasis], first: int) -> Array:
@@ -386,7 +392,7 @@ def _widened(covariance: Array, left_out: Array, sheets: Array, starts: Sequence
     for s, start in enumerate(starts):
         known = np.isfinite(left_out[:, s]).all(1)
         count = int(known.sum())
-        if count < 3:
+        if count < 4:
             continue
         sign = np.sign(left_out[known, s, :3] @ sheets[s, :3])
         others = left_out[known, s] * sign[:, None]

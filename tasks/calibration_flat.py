@@ -44,7 +44,7 @@ class Priors(NamedTuple):
     sheet_deg: float = 2.0
     sheet_m: float = 0.04
     boresight_deg: float = 1.0
-    altimeter_m: float = 0.005
+    altimeter_m: float = 0.001
     floor_slope_deg: float = 0.5
 
 
