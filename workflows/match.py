@@ -58,10 +58,11 @@ def _match(job: Job, pair: PairTask, keys: tuple[str, str], a: Entry, b: Entry) 
         round(pair.range_m, 6),
         round(pair.margin_m, 6),
     ]
-    return once(job, STEP, VERSION, [*keys, *known], parameters, lambda: _motion(job, pair, a, b))
+    return once(job, STEP, VERSION, [*keys, *known], parameters, lambda: between(job, pair, a, b))
 
 
-def _motion(job: Job, pair: PairTask, a: Entry, b: Entry) -> Made:
+def between(job: Job, pair: PairTask, a: Entry, b: Entry) -> Made:
+    """Motion between two extracted images; their laser may be left out, which leaves its length open."""
     lens, p = job.calibration.camera, job.parameters.match
     if "feature_uv" not in a.arrays or "feature_uv" not in b.arrays:
         return Made({}, {"model": "", "matches": 0, "inliers": 0})
