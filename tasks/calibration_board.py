@@ -39,13 +39,13 @@ class BoardData(NamedTuple):
 
     Attributes
     ----------
-    corner_uv : (P, 2) pixels. corner_X : (P, 3) on the board, metres. corner_image : (P,).
+    corner_uv : (P, 2) pixels. corner_board : (P, 3) on the board, metres. corner_image : (P,).
     laser_uv : (L, 2) pixels of light on the board's plane. laser_sheet, laser_image : (L,). laser_sigma_px : (L,).
     images : how many.
     """
 
     corner_uv: Array
-    corner_X: Array
+    corner_board: Array
     corner_image: Indices
     laser_uv: Array
     laser_sheet: Indices
@@ -196,7 +196,7 @@ def _within(off: Array) -> NDArray[np.bool_]:
 
 def _by_image(data: BoardData) -> list[tuple[Array, Array]]:
     own = [data.corner_image == k for k in range(data.images)]
-    return [(data.corner_X[o], data.corner_uv[o]) for o in own]
+    return [(data.corner_board[o], data.corner_uv[o]) for o in own]
 
 
 def _first_sheet(name: str, X: Array) -> SheetBasis:
@@ -243,7 +243,7 @@ def _chosen(p: _Problem, corner: NDArray[np.bool_], laser: NDArray[np.bool_]) ->
     d = p.data
     kept = BoardData(
         d.corner_uv[corner],
-        d.corner_X[corner],
+        d.corner_board[corner],
         d.corner_image[corner],
         d.laser_uv[laser],
         d.laser_sheet[laser],
@@ -308,7 +308,7 @@ def _misfits(x: Array, p: _Problem) -> tuple[Array, Array]:
     """Corners (P, 2), pixels, and gaps (L,), in stated sigmas."""
     camera, sheets, poses = _unpacked(x, p)
     R = Rotation.from_rotvec(poses[:, :3]).as_matrix()[p.data.corner_image]
-    X = np.einsum("pij,pj->pi", R, p.data.corner_X) + poses[p.data.corner_image, 3:]
+    X = np.einsum("pij,pj->pi", R, p.data.corner_board) + poses[p.data.corner_image, 3:]
     gaps = _gaps(camera, sheets, poses, p.data)
     return np.nan_to_num(project(camera, X) - p.data.corner_uv, nan=1e3), gaps / (p.per_px * p.data.laser_sigma_px)
 

@@ -14,7 +14,7 @@ _LONGEST_SEGMENT_M = 0.08
 _FLATTEST = 0.3  # sine of the least angle at which lines cross
 _BESIDE_SLOPE = 0.02
 _FOOT_M = 0.05
-_MOST_BESIDE_A_PAIR = 60
+_MOST_BESIDE_A_PAIR = 20
 
 
 def crossings(points: Points, X_local: Array) -> Crossings:
@@ -86,7 +86,7 @@ def feet(points: Points, X_local: Array, reference: Array, image: Indices, from_
 
 
 def thinned(matches: Matches, beside: Beside, most: int) -> Indices:
-    """Indices of the matches to keep: of each pair all those beside a line up to sixty, and `most` others."""
+    """Indices of the matches to keep: of each pair all those beside a line up to twenty, and `most` others."""
     near = np.zeros(len(matches.i), bool)
     near[beside.match] = True
     key = matches.i * (int(matches.j.max(initial=0)) + 1) + matches.j

@@ -15,7 +15,6 @@ from ..schemas.calibration import Calibration
 from .calibration_sheets import SheetBasis, basis, cast_rays, moved
 from .calibration_solve import Layout, Solved, solve, unit_sigma
 from .camera import normalised, rays
-from .motion import depths, sampson
 from .rotations import R_vehicle_camera
 
 Array = NDArray[np.float64]
@@ -29,6 +28,11 @@ _WHITE_SHARE: Final = 0.3
 _JITTER_M: Final = 0.003
 _OUTLIER_SIGMAS: Final = 4.0
 GROUPS: Final = ("crossover", "beside", "match", "altimeter", "track", "depth", "attitude")
+# Errors of neighbours are alike (one stone beside a line, one feature in many pairs): a group counts as if its sigma
+# were so many times larger than its residuals say.
+_CORRELATED: Final = np.array([1.5, 4.0, 1.5, 1.5, 1.0, 1.0, 1.0])
+# No group may claim to be much better than stated: a survey that shrinks to nothing has no residuals at all.
+_BEST, _WORST = 0.25, 50.0
 
 
 class FieldPriors(NamedTuple):
@@ -189,7 +193,7 @@ def posed(x: Array, calibration: Calibration, priors: FieldPriors, track: Track)
     shared, images = layout(priors, track).split(x)
     turn = Rotation.from_rotvec(track.turn_rate * shared[_CLOCK])
     bias = Rotation.from_rotvec(shared[_ATTITUDE])
-    R_local_vehicle = (Rotation.from_matrix(track.R_local_vehicle) * turn * bias * Rotation.from_rotvec(images[:, 3:]))
+    R_local_vehicle = Rotation.from_matrix(track.R_local_vehicle) * turn * bias * Rotation.from_rotvec(images[:, 3:])
     R = R_local_vehicle.as_matrix()
     reference = track.X_local + track.velocity * shared[_CLOCK] + images[:, :3]
     mount = np.array(calibration.mount.rotation) + np.degrees(shared[_MOUNT])
@@ -236,28 +240,23 @@ def crossing_heights(p: Crossings, X_local: Array) -> Array:
     return (apart * normal).sum(1)
 
 
-def _relative(at: Posed, i: Indices, j: Indices) -> tuple[Array, Array]:
-    """R_i_j (M, 3, 3) and t_i_j (M, 3)."""
-    R_i = at.R[i]
-    return np.einsum("mki,mkj->mij", R_i, at.R[j]), np.einsum("mki,mk->mi", R_i, at.C[j] - at.C[i])
-
-
-def _by_pair(p: FieldProblem) -> list[tuple[int, int, Indices]]:
-    key = p.matches.i * (len(p.track.time_s) + 1) + p.matches.j
-    order = np.argsort(key, kind="stable")
-    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-    runs = np.split(order, starts[1:]) if len(order) else []
-    return [(int(p.matches.i[run[0]]), int(p.matches.j[run[0]]), run) for run in runs]
-
-
-def _match_residuals(p: FieldProblem, cast: _Cast, at: Posed, pairs: list) -> tuple[Array, Array]:
+def _match_residuals(p: FieldProblem, cast: _Cast, at: Posed) -> tuple[Array, Array]:
     """Sampson distances (M,), pixels, and triangulated depths (M, 2) in both cameras."""
-    distance, depth = np.zeros(len(p.matches.i)), np.full((len(p.matches.i), 2), np.nan)
-    for i, j, own in pairs:
-        R, t = at.R[i].T @ at.R[j], at.R[i].T @ (at.C[j] - at.C[i])
-        distance[own] = sampson(cast.slopes_i[own], cast.slopes_j[own], R, t) * cast.focal_px
-        depth[own] = np.column_stack(depths(cast.slopes_i[own], cast.slopes_j[own], R, t))
-    return distance, depth
+    i, j = p.matches.i, p.matches.j
+    R = np.einsum("mki,mkj->mij", at.R[i], at.R[j])
+    t = np.einsum("mki,mk->mi", at.R[i], at.C[j] - at.C[i])
+    ray_i, ray_j = (np.column_stack([x, np.ones(len(x))]) for x in (cast.slopes_i, cast.slopes_j))
+    turned = np.einsum("mij,mj->mi", R, ray_j)
+    base = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-9)
+    line_i = np.cross(base, turned)
+    line_j = np.einsum("mij,mi->mj", R, np.cross(ray_i, base))
+    spread = np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1))
+    distance = (ray_i * line_i).sum(1) / np.maximum(spread, 1e-12) * cast.focal_px
+    # where the two rays come closest, as `motion.depths`
+    a, b, c = (ray_i**2).sum(1), (ray_i * turned).sum(1), (turned**2).sum(1)
+    e, f = (ray_i * t).sum(1), (turned * t).sum(1)
+    determinant = np.maximum(a * c - b * b, 1e-12)
+    return distance, np.column_stack([c * e - b * f, b * e - a * f]) / determinant[:, None]
 
 
 def _stated(p: FieldProblem, cast: _Cast, at: Posed, X: Array) -> list[Array]:
@@ -286,12 +285,12 @@ def _stated(p: FieldProblem, cast: _Cast, at: Posed, X: Array) -> list[Array]:
     ]
 
 
-def _misfits(x: Array, p: FieldProblem, cast: _Cast, pairs: list) -> list[Array]:
+def _misfits(x: Array, p: FieldProblem, cast: _Cast) -> list[Array]:
     """Residuals of each group, in its own unit."""
     at = posed(x, p.calibration, p.priors, p.track)
     X, X_local = points_local(x, p, cast, at)
     shared, images = layout(p.priors, p.track).split(x)
-    distance, depth = _match_residuals(p, cast, at, pairs)
+    distance, depth = _match_residuals(p, cast, at)
     beside = depth[p.beside.match, p.beside.side] - X[p.beside.point, 2]
     foot = at.reference[p.feet.image] + p.feet.from_reference
     feet = foot[:, 2] + shared[_ALTIMETER] - X_local[p.feet.point, 2]
@@ -343,32 +342,30 @@ def adjust_field(p: FieldProblem, x: Array, rounds: int = 3) -> FieldResult:
     ----------
     p : observations. x : unknowns to begin with.
     """
-    cast, pairs = _prepared(p), _by_pair(p)
+    cast = _prepared(p)
     at = posed(x, p.calibration, p.priors, p.track)
     stated = np.concatenate(_stated(p, cast, at, points_local(x, p, cast, at)[0]))
     group, rows, prior = _group_of(p), _rows(p), prior_sigma(p.priors, p.track)
     sigma, weight = p.sigma.copy(), np.ones(len(stated))
 
     def misfit(y: Array) -> Array:
-        return np.concatenate(_misfits(y, p, cast, pairs)) / stated
+        return np.concatenate(_misfits(y, p, cast)) / stated
 
     weight = _inliers(misfit(x), group[: len(stated)])
     solved: Solved | None = None
     for _ in range(rounds):
-        factor = weight / sigma[group[: len(stated)]]
+        counted = sigma * _CORRELATED
+        factor = weight / counted[group[: len(stated)]]
         solved = solve(
             lambda y, k=factor: np.concatenate([misfit(y) * k, y[:SHARED] / prior]), x, layout(p.priors, p.track), rows
         )
         x = solved.x
-        sigma = np.array(
-            [
-                np.clip(sigma[g] * unit_sigma(solved, (group == g) & (np.append(weight, np.zeros(SHARED)) > 0)), 0.02, 50)
-                for g in range(len(GROUPS))
-            ]
-        )
+        lit = np.append(weight, np.zeros(SHARED)) > 0
+        unit = [unit_sigma(solved, (group == g) & lit) for g in range(len(GROUPS))]
+        sigma = np.clip(counted * unit, _BEST, _WORST)
         weight = _inliers(misfit(x), group[: len(stated)])
     assert solved is not None
-    heights = _misfits(x, p, cast, pairs)[0]
+    heights = _misfits(x, p, cast)[0]
     return FieldResult(
         sheets=sheets_of(x, p.starts),
         mount_deg=np.array(p.calibration.mount.rotation) + np.degrees(x[_MOUNT]),
@@ -395,3 +392,8 @@ def _inliers(misfit: Array, group: Indices) -> Array:
         off = np.abs(misfit[own])
         weight[own] = off < _OUTLIER_SIGMAS * max(1.4826 * float(np.median(off)), 1e-9)
     return weight
+
+
+def heights_with(p: FieldProblem, x: Array) -> Array:
+    """Height differences (C,) of the problem's crossovers for unknowns x, metres."""
+    return _misfits(x, p, _prepared(p))[0]

@@ -4,6 +4,7 @@ All light of an image lies on one plane, the floor; navigation says how far and 
 and local frames are those of FORMATS ("Frames of reference").
 """
 
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -297,7 +298,7 @@ def _noise(p: _Problem, solved: Solved) -> Array:
     measured = int(np.isfinite(p.data.altitude_m).sum())
     number = np.arange(len(solved.residual))
     starts = np.cumsum([0, points, measured, count, 2 * count])
-    groups = [(number >= a) & (number < b) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    groups = [(number >= a) & (number < b) for a, b in pairwise(starts)]
     scale = [unit_sigma(solved, group) for group in groups]
     return np.array(
         [

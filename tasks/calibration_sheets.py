@@ -91,7 +91,7 @@ def line_on_floor(camera: Camera, sheet: Array, altitude_m: float, count: int = 
     low, high = edge.min(0), edge.max(0)
     Y = np.linspace(low[1], high[1], count)
     X = (sheet[3] - sheet[2] * altitude_m - sheet[1] * Y) / sheet[0]
-    seen = (X > low[0]) & (X < high[0])
+    seen = (low[0] < X) & (high[0] > X)
     return np.column_stack([X, Y, np.full(count, altitude_m)])[seen]
 
 

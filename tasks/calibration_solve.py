@@ -105,9 +105,9 @@ def solve(residuals: Callable[[Array], Array], start: Array, layout: Layout, row
         start,
         jac=lambda x: jacobian(residuals, x, layout, rows),
         x_scale=layout.scale,
-        max_nfev=30,
-        xtol=1e-10,
-        ftol=1e-9,
+        max_nfev=20,
+        xtol=1e-8,
+        ftol=1e-7,
         gtol=1e-12,
     )
     J = np.asarray(found.jac)

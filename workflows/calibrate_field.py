@@ -16,8 +16,8 @@ from ..tasks.camera import normalised, rays
 from . import calibrate_inputs as inputs
 from .job import log
 
-_ROUNDS = 4
-_MATCHES_A_PAIR = 40
+_ROUNDS = 3
+_MATCHES_A_PAIR = 15
 _MIN_CROSSINGS = 12
 
 
