@@ -77,6 +77,8 @@ def jacobian(residuals: Callable[[Array], Array], x: Array, layout: Layout, rows
 
     for k in range(layout.shared):
         J[:, k] = difference(np.array([k])) / (_STEP * layout.scale[k])
+    if not layout.images:
+        return J
     colour = colours(layout.images, rows)
     of_row = np.where(rows >= 0, colour[rows], -1)
     number = np.arange(len(rows))
