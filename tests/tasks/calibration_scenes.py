@@ -66,7 +66,7 @@ def floor(true: Calibration, altitudes: Array, seed: int = 0, noise: float = 1.0
 
 
 def _on_floor(R: Array, C: Array, sheet: Array, elevation: float) -> Array:
-    """Points (200, 3), camera frame, where a sheet meets a level floor."""
+    """Points (40, 3), camera frame, where a sheet meets a level floor."""
     floor_normal = R[2]
     floor_offset = elevation - C[2]
     direction = np.cross(sheet[:3], floor_normal)
@@ -74,7 +74,7 @@ def _on_floor(R: Array, C: Array, sheet: Array, elevation: float) -> Array:
     A = np.stack([sheet[:3], floor_normal, direction])
     point = np.linalg.solve(A, [sheet[3], floor_offset, 0.0])
     point = point - direction * point[1] / direction[1]
-    return point + np.linspace(-2, 2, 200)[:, None] * direction
+    return point + np.linspace(-2, 2, 40)[:, None] * direction
 
 
 def board_poses(count: int, seed: int = 0) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from tests.tasks.calibration_scenes import board_poses, calibration
 FREE = ("fx", "fy", "cx", "cy", "k1")
 
 
-def seen(true, count=10, seed=0, corner_px=0.1, laser_px=0.2):
+def seen(true, count=7, seed=0, corner_px=0.1, laser_px=0.2):
     """Corners and light of a board of 9 x 7 corners, squares of 60 mm."""
     rng, (R, t) = np.random.default_rng(seed), board_poses(count, seed)
     x, y = np.meshgrid(np.arange(9), np.arange(7))
@@ -25,8 +25,8 @@ def seen(true, count=10, seed=0, corner_px=0.1, laser_px=0.2):
         for s, sheet in enumerate(true.laser.sheets):
             normal = R[k].T @ np.array(sheet.normal)
             offset = sheet.offset - np.array(sheet.normal) @ t[k]
-            along = np.linspace(-0.4, 0.4, 80)
-            line = np.column_stack([(offset - normal[1] * along) / normal[0], along, np.zeros(80)])
+            along = np.linspace(-0.4, 0.4, 30)
+            line = np.column_stack([(offset - normal[1] * along) / normal[0], along, np.zeros(30)])
             uv = project(true.camera, line @ R[k].T + t[k])
             ok = np.isfinite(uv).all(1) & ((uv > 0) & (uv < [1215, 911])).all(1) & (np.abs(line[:, 0]) < 0.6)
             moved = uv[ok] + np.column_stack([rng.normal(0, laser_px, ok.sum()), np.zeros(ok.sum())])
