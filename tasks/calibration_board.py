@@ -110,12 +110,14 @@ def thinned(uv: Array, sheet: Indices, sigma_px: Array) -> Indices:
     return np.concatenate(chosen) if chosen else np.zeros(0, np.intp)
 
 
-def first_camera(corners: Sequence[tuple[Array, Array]], size: tuple[int, int], model: Model) -> Camera:
+def first_camera(
+    corners: Sequence[tuple[Array, Array]], size: tuple[int, int], model: Model, free: Sequence[str]
+) -> Camera:
     """Interior orientation by OpenCV's own calibration, from board points (N, 3) and pixels (N, 2) of each image.
 
     Parameters
     ----------
-    size : width and height.
+    size : width and height. free : names that the adjustment estimates; other distortion is left at zero.
     """
     board = [np.ascontiguousarray(X, np.float32).reshape(-1, 1, 3) for X, _ in corners]
     pixels = [np.ascontiguousarray(uv, np.float32).reshape(-1, 1, 2) for _, uv in corners]
@@ -130,6 +132,8 @@ def first_camera(corners: Sequence[tuple[Array, Array]], size: tuple[int, int], 
         flags = cv2.CALIB_FIX_K3 | cv2.CALIB_USE_LU
         _, K, D, _, _ = cv2.calibrateCamera(board, pixels, size, np.eye(3), np.zeros(5), flags=flags)
         distortion = D.ravel()[:5]
+    names = _DISTORTION["fisheye" if model == "fisheye" else "brown"]
+    distortion = [float(v) if name in free else 0.0 for name, v in zip(names, distortion, strict=True)]
     return Camera(
         model="fisheye" if model == "fisheye" else "brown",
         width=width,
@@ -138,7 +142,7 @@ def first_camera(corners: Sequence[tuple[Array, Array]], size: tuple[int, int], 
         fy=float(K[1, 1]),
         cx=float(K[0, 2]),
         cy=float(K[1, 2]),
-        distortion=tuple(float(v) for v in distortion),
+        distortion=tuple(distortion),
     )
 
 

@@ -75,7 +75,7 @@ def run_board(folder: Path, out: Path, setup: BoardSetup, parameters: Parameters
     calibrate.prepare(out)
     seen = _look(folder, setup, parameters)
     camera = _first_camera(seen, setup)
-    free = () if setup.hold_camera else _free(camera, len(seen.names))
+    free = () if setup.hold_camera else _free(camera.model, len(seen.names))
     found = adjusting.calibrate_board(_data(seen), camera, free)
     result = _calibration(found, setup)
     if result.laser is None and len(found.sheets):
@@ -83,14 +83,14 @@ def run_board(folder: Path, out: Path, setup: BoardSetup, parameters: Parameters
     return calibrate.write(out, result, _page(folder, seen, setup, found, free, result))
 
 
-def _free(camera: Camera, images: int) -> tuple[str, ...]:
-    free = _FREE[camera.model]
+def _free(model: adjusting.Model, images: int) -> tuple[str, ...]:
+    free = _FREE[model]
     return tuple(name for name in free if images >= _FEW or name not in ("p1", "p2"))
 
 
 def _first_camera(seen: _Seen, setup: BoardSetup) -> Camera:
     if setup.start is None:
-        return adjusting.first_camera(seen.corners, seen.size, setup.model)
+        return adjusting.first_camera(seen.corners, seen.size, setup.model, _free(setup.model, len(seen.names)))
     camera = setup.start.camera
     if (camera.width, camera.height) != seen.size:
         found, expected = f"{seen.size[0]} x {seen.size[1]}", f"{camera.width} x {camera.height} pixels"

@@ -42,7 +42,7 @@ def first(data, true):
     pairs = [
         (data.corner_board[data.corner_image == k], data.corner_uv[data.corner_image == k]) for k in range(data.images)
     ]
-    return board.first_camera(pairs, (true.camera.width, true.camera.height), "brown")
+    return board.first_camera(pairs, (true.camera.width, true.camera.height), "brown", FREE)
 
 
 def test_camera_and_sheets_within_their_sigmas():
