@@ -28,7 +28,7 @@ def crossings(points: Points, X_local: Array) -> Crossings:
     length = np.linalg.norm(X_local[first + 1, :2] - X_local[first, :2], axis=1)
     first = first[np.isfinite(length) & (length < _LONGEST_SEGMENT_M) & (length > 0)]
     ends = np.stack([X_local[first, :2], X_local[first + 1, :2]], axis=1)
-    segments = shapely.linestrings(ends)
+    segments = np.asarray(shapely.linestrings(ends))
     a, b = shapely.STRtree(segments).query(segments, predicate="intersects")
     line = points.image * 2 + points.arm
     keep = (a < b) & (line[first[a]] != line[first[b]])
@@ -59,7 +59,9 @@ def beside_lines(points: Points, matches: Matches, slopes: Array, slopes_i: Arra
                 continue
             apart, nearest = KDTree(slopes[lit]).query(x[own], distance_upper_bound=_BESIDE_SLOPE)
             near = np.isfinite(apart)
-            parts.append((own[near], np.full(near.sum(), side), lit[nearest[near]], apart[near]))
+            parts.append(
+                (own[near], np.full(near.sum(), side), lit[np.asarray(nearest)[near]], np.asarray(apart)[near])
+            )
     if not parts:
         none = np.zeros(0, np.intp)
         return Beside(none, none, none, np.zeros(0))
@@ -82,7 +84,7 @@ def feet(points: Points, X_local: Array, reference: Array, image: Indices, from_
         return Feet(none, np.zeros((0, 3)), none, np.zeros(0))
     apart, nearest = KDTree(X_local[known, :2]).query(foot[:, :2], distance_upper_bound=_FOOT_M)
     near = np.isfinite(apart)
-    return Feet(image[near], from_reference[near], known[nearest[near]], apart[near])
+    return Feet(image[near], from_reference[near], known[np.asarray(nearest)[near]], np.asarray(apart)[near])
 
 
 def thinned(matches: Matches, beside: Beside, most: int) -> Indices:

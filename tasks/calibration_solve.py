@@ -105,7 +105,7 @@ def solve(residuals: Callable[[Array], Array], start: Array, layout: Layout, row
     found = least_squares(
         residuals,
         start,
-        jac=lambda x: jacobian(residuals, x, layout, rows),
+        jac=lambda x: jacobian(residuals, x, layout, rows),  # pyright: ignore[reportArgumentType]
         x_scale=layout.scale,
         max_nfev=20,
         xtol=1e-8,

@@ -85,7 +85,7 @@ def _charuco(image: Grey, board: Board) -> tuple[Array, Array] | None:
     found, ids, _, _ = cv2.aruco.CharucoDetector(target).detectBoard(image)
     if ids is None or len(ids) < 8:
         return None
-    flat = np.asarray(target.getChessboardCorners(), np.float64)[np.ravel(ids)]
+    flat = np.asarray(target.getChessboardCorners(), np.float64)[np.ravel(np.asarray(ids)).astype(np.intp)]
     return flat, np.asarray(found, np.float64).reshape(-1, 2)
 
 

@@ -44,7 +44,7 @@ class Written(NamedTuple):
     """What a calibration left: the file, the report and the page's content."""
 
     calibration: Path
-    report: Path
+    html: Path
     page: report.Page
     result: Calibration
 
@@ -259,7 +259,7 @@ def _flat_page(
     size = (start.camera.width, start.camera.height)
     names = [f"sheet {s.name}" for s in found.starts]
     residuals = report.residual_map(data.uv[lit], 1e3 * found.residual_m[lit], size, data.arm[lit], names, "mm")
-    by_image = report.bars(1e3 * found.image_m.T, names, "image", "mean height above the floor (mm)")
+    by_image = report.bars(list(1e3 * found.image_m.T), names, "image", "mean height above the floor (mm)")
     facts = (
         ("Missions", ", ".join(missions)),
         ("Images with both lines", f"{len(data.X_local)}"),
@@ -447,7 +447,8 @@ def _field_left_out(problem: field.FieldProblem, full: field.FieldResult, range_
     lines, count = [], len(problem.crossings.f)
     for turn, name in enumerate(("odd", "even")):
         out = np.arange(count) % 2 == turn
-        kept = field.Crossings(*(part[~out] for part in problem.crossings))
+        c = problem.crossings
+        kept = field.Crossings(c.p[~out], c.q[~out], c.f[~out], c.g[~out])
         found = field.adjust_field(problem._replace(crossings=kept, sigma=full.sigma), full.x, rounds=1)
         off = field.heights_with(problem, found.x)[out & full.used]
         change = [altitude_error(problem.calibration.camera, full.sheets[s], found.sheets[s], range_m) for s in (0, 1)]

@@ -130,4 +130,4 @@ def _show(written: Any) -> None:
         _console.print(Text(f"- {statement}"))
     for warning in written.page.warnings:
         _console.print(Text("warning: ", "yellow") + Text(warning))
-    _console.print(Text(f"{written.calibration} and {written.report}"))
+    _console.print(Text(f"{written.calibration} and {written.html}"))

@@ -57,7 +57,7 @@ def calibrate_field(
     calibration = survey.opened.calibration
     starts, x = field.field_starts(calibration), np.zeros(0)
     x = np.zeros(field.layout(priors, made.track).scale.size)
-    sigma, outcome = np.ones(len(field.GROUPS)), None
+    sigma, outcome, problem = np.ones(len(field.GROUPS)), None, None
     for turn in range(_ROUNDS):
         points = inputs.soundings(survey, _calibration(calibration, starts, x), parameters)
         problem = _problem(made, calibration, priors, points, x)._replace(sigma=sigma)
@@ -70,6 +70,7 @@ def calibrate_field(
         rms = 1e3 * float(np.sqrt(np.mean(outcome.crossing_m[outcome.used] ** 2)))
         log.info("step=calibrate round=%d crossovers=%d rms_mm=%.2f", turn + 1, len(outcome.crossing_m), rms)
     assert outcome is not None
+    assert problem is not None
     return FieldOutcome(problem, outcome, made.range_m)
 
 
@@ -112,7 +113,8 @@ def _problem(
     slopes = [normalised(camera, uv, made.range_m) for uv in (points.uv, made.matches.uv_i, made.matches.uv_j)]
     beside = crossovers.beside_lines(points, made.matches, *slopes)
     kept = crossovers.thinned(made.matches, beside, _MATCHES_A_PAIR)
-    matches = field.Matches(*(column[kept] for column in made.matches))
+    m = made.matches
+    matches = field.Matches(m.i[kept], m.j[kept], m.uv_i[kept], m.uv_j[kept])
     beside = crossovers.beside_lines(points, matches, slopes[0], slopes[1][kept], slopes[2][kept])
     image, foot = made.feet
     feet = crossovers.feet(points, X_local, at.reference, image, foot)
@@ -139,7 +141,7 @@ def _only_used(p: field.FieldProblem) -> field.FieldProblem:
     number = np.full(len(p.points.uv), -1, np.intp)
     number[used] = np.arange(len(used))
     return p._replace(
-        points=field.Points(*(column[used] for column in p.points)),
+        points=field.Points(p.points.uv[used], p.points.image[used], p.points.arm[used], p.points.sigma_px[used]),
         crossings=p.crossings._replace(p=number[p.crossings.p], q=number[p.crossings.q]),
         beside=p.beside._replace(point=number[p.beside.point]),
         feet=p.feet._replace(point=number[p.feet.point]),

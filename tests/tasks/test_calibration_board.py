@@ -83,7 +83,7 @@ def test_camera_behind_a_port():
 
 
 def picture(lines):
-    """A tilted chessboard of 7 x 6 corners on grey, and green lines from top to bottom (u at the top, at the bottom)."""
+    """A tilted chessboard of 7 x 6 corners on grey, and green lines (u at the top, u at the bottom)."""
     squares = np.kron(np.indices((7, 8)).sum(0) % 2, np.ones((40, 40))) * 180 + 40
     page = np.full((400, 440), 220, np.float32)
     page[60:340, 60:380] = squares
