@@ -9,6 +9,9 @@ BIN := $(VENV)/bin
 # the certificates of the machine, not uv's own; pip takes over where uv cannot reach the index
 INSTALL := $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python
 
+# small matrices, two test processes: threads of the linear algebra would only wait for each other
+export OPENBLAS_NUM_THREADS := 1
+export OMP_NUM_THREADS := 1
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/matplotlib
 
 .PHONY: demo test test-all lint setup lock clean

@@ -120,3 +120,38 @@ def _in_gap(times: Times, at: Times) -> NDArray[np.bool_]:
     longest = max(GAP_S, _GAP_INTERVALS * float(np.median(intervals)))
     before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(intervals) - 1)
     return (intervals[before] > longest) & (at > times[before]) & (at < times[before + 1])
+
+
+def smoothed(navigation: Navigation, window_s: float, level_floor: bool = False) -> Navigation:
+    """Navigation whose depth, altitude, roll and pitch are replaced by local parabolas over +-window_s.
+
+    Noise from sample to sample averages out; the slow motion of a vehicle stays. Where a window has fewer than six
+    samples they are left as they are.
+
+    Parameters
+    ----------
+    window_s : half of the window, seconds; a third of the shortest period of the vehicle's motion does no harm.
+    level_floor : the sum of depth and altitude hardly changes, and its local mean is better than a parabola.
+    """
+    time = _seconds(navigation.ns, int(navigation.ns[0]) if len(navigation.ns) else 0)
+    columns = {name: _local(time, getattr(navigation, name), window_s, 2) for name in ("depth", "roll", "pitch")}
+    if level_floor:
+        floor = _local(time, navigation.depth + navigation.altitude, window_s, 0)
+        columns["altitude"] = np.maximum(floor - columns["depth"], 0)
+    else:
+        columns["altitude"] = _local(time, navigation.altitude, window_s, 2)
+    return navigation._replace(**columns)
+
+
+def _local(time: Array, values: Array, window_s: float, degree: int) -> Array:
+    """The middle of a polynomial fitted to the samples around each one."""
+    known = np.isfinite(values)
+    found, t, y = values.copy(), time[known], values[known]
+    first, last = np.searchsorted(t, t - window_s), np.searchsorted(t, t + window_s, side="right")
+    result = y.copy()
+    for k in np.flatnonzero(last - first >= 6):
+        own = slice(first[k], last[k])
+        powers = ((t[own] - t[k]) / window_s)[:, None] ** np.arange(degree + 1)
+        result[k] = np.linalg.lstsq(powers, y[own], rcond=None)[0][0]
+    found[known] = result
+    return found

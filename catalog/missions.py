@@ -13,6 +13,7 @@ from ..schemas.timestamps import iso
 from .coordinate_systems import Place, Systems, resolve
 from .digests import inspect_images, peek_images
 from .frames_table import build_frames
+from .interpolation import smoothed
 from .mission_files import MissionFiles, find_images
 from .mission_inputs import MISSION, MissionInputs, input_warnings, read_inputs
 
@@ -45,7 +46,15 @@ class OpenedMission(NamedTuple):
     warnings: list[str]
 
 
-def open_mission(url: str, digests: MutableMapping[str, Any] | None = None, *, hashed: bool = True) -> OpenedMission:
+def open_mission(
+    url: str,
+    digests: MutableMapping[str, Any] | None = None,
+    *,
+    hashed: bool = True,
+    smooth_s: float = 0.0,
+    level_floor: bool = False,
+    shift_s: float = 0.0,
+) -> OpenedMission:
     """Read and check all files of a mission; nothing is written to it.
 
     Parameters
@@ -54,6 +63,9 @@ def open_mission(url: str, digests: MutableMapping[str, Any] | None = None, *, h
     digests : what earlier runs learnt of the images, by path, size and time of change, so that a rerun does not
         read them all again; added to. Its values are plain lists, fit for JSON.
     hashed : False to look at the images' headers only, for a quick check; `sha256` is empty then.
+    smooth_s : half the window over which depth, altitude, roll and pitch are smoothed, seconds; 0 for not at all.
+    level_floor : the seabed is flat, so that altitudes are smoothed together with depths.
+    shift_s : seconds added to navigation times besides the mission's own time_offset.
 
     Raises
     ------
@@ -72,6 +84,11 @@ def open_mission(url: str, digests: MutableMapping[str, Any] | None = None, *, h
     # What is wrong anyway is said without reading gigabytes first.
     quick = problems or not hashed
     inspections = peek_images(files.fs, listed) if quick else inspect_images(files.fs, listed, digests)
+    if inputs.navigation is not None and smooth_s > 0:
+        inputs = inputs._replace(navigation=smoothed(inputs.navigation, smooth_s, level_floor))
+    if mission.navigation is not None and shift_s:
+        source = mission.navigation.model_copy(update={"time_offset": mission.navigation.time_offset + shift_s})
+        mission = mission.model_copy(update={"navigation": source})
     frames = build_frames(images, inspections, inputs, mission)
     systems = _systems(inputs, mission, frames.table)
     problems += [*systems.problems, *_tide_problems(inputs, mission, frames.table)]

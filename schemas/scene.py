@@ -97,6 +97,9 @@ class SurveyScene(Model):
     longitude: Annotated[float, Field(ge=-180, le=180, description="of the origin, degrees")] = 6.0127
     lines: Annotated[int, Field(ge=1, le=100)] = 3
     altitude_m: Annotated[float, Field(gt=0.3, le=30, description="of the camera above the datum")] = 2.7
+    altitude_step_m: Annotated[
+        float, Field(ge=0, le=5, description="by which each line is sailed higher than the one before")
+    ] = 0.0
     heading_deg: Annotated[float, Field(ge=0, lt=360, description="of the first line, from true north")] = 20.0
     speed_m_s: Annotated[float, Field(gt=0, le=5)] = 0.3
     overlap: Annotated[float, Field(ge=-1, lt=0.99, description="of successive images of a line")] = 0.57
@@ -106,6 +109,11 @@ class SurveyScene(Model):
     ] = "combined"
     pair_delay_s: Annotated[float, Field(gt=0, le=60, description="from a texture image to its laser image")] = 2.0
     wobble: Annotated[float, Field(ge=0, le=10, description="1: degrees and centimetres of a real vehicle")] = 1.0
+
+    @property
+    def highest_m(self) -> float:
+        """Altitude of the last line."""
+        return self.altitude_m + (self.lines - 1) * self.altitude_step_m
 
 
 class NavigationScene(Model):
@@ -148,7 +156,7 @@ class Scene(Model):
     def _possible(self) -> "Scene":
         if self.survey.roles in ("laser", "pairs") and not self.laser.enabled:
             raise ValueError(f"survey.roles is {self.survey.roles} but laser.enabled is false")
-        if self.survey.altitude_m >= self.terrain.depth_m:
+        if self.survey.highest_m >= self.terrain.depth_m:
             raise ValueError("survey.altitude_m must be less than terrain.depth_m: the camera would be in the air")
         if self.survey.lines > self.images:
             raise ValueError(f"{self.survey.lines} lines need at least as many images, found {self.images}")
@@ -220,6 +228,13 @@ SCENES: Final[dict[str, Scene]] = {
             "images": 16,
             "camera": {"model": "flat-port", "distortion": (), "port": {"distance": 0.035, "thickness": 0.012}},
             "survey": {"lines": 2, "altitude_m": 2.2, "overlap": 0.5},
+            "navigation": _GOOD_NAVIGATION,
+        },
+        {
+            "name": "floor",
+            "images": 32,
+            "terrain": {"kind": "plane", "depth_m": 8.0},
+            "survey": {"lines": 4, "altitude_m": 1.8, "altitude_step_m": 0.5, "overlap": 0.4, "sidelap": 0.6},
             "navigation": _GOOD_NAVIGATION,
         },
         {"name": "demo", "images": 24, "width": 912, "survey": {"overlap": 0.5, "sidelap": 0.45}},

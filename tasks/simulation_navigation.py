@@ -134,7 +134,7 @@ def trajectory(plan: Plan, time_s: Array) -> States:
         [
             along * np.sin(bow) + across * np.cos(bow),
             along * np.cos(bow) - across * np.sin(bow),
-            plan.z_m + sway[1],
+            plan.z_m + sway[1] + survey.altitude_step_m * (line + turn / np.pi),
         ]
     )
     heading = survey.heading_deg + np.where(there > 0, 0, 180) + there * np.degrees(turn) + sway[4]

@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..schemas.problems import InvalidInput
+from .calibrate_commands import app as calibrate_app
 from .job import log
 
 FAILED, INVALID = 1, 2
@@ -25,6 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
+app.add_typer(calibrate_app, name="calibrate")
 _console = Console()
 _errors = Console(stderr=True)
 
@@ -74,7 +76,8 @@ def check(mission: MissionArgument, params: ParamsOption = None, set_: SetOption
 @app.command()
 def simulate(
     scene: Annotated[
-        str, typer.Argument(metavar="SCENE", help="plane, box, pool, reef, sea, night, pairs, sand, port or demo.")
+        str,
+        typer.Argument(metavar="SCENE", help="plane, box, pool, reef, sea, night, pairs, sand, port, floor or demo."),
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A new folder.")],
     seed: Annotated[int, typer.Option(help="Another seed, another seabed.")] = 0,

@@ -92,12 +92,16 @@ def _match(job: Job, pair: PairTask, keys: Sequence[str], loaded: Mapping[int, E
 
     def make() -> Made:
         lit_i, lit_j = (tuple((loaded[lit.row], lit.step) for lit in side) for side in (pair.lit_i, pair.lit_j))
-        return _motion(job, pair, loaded[pair.i], loaded[pair.j], (lit_i, lit_j))
+        return between(job, pair, loaded[pair.i], loaded[pair.j], (lit_i, lit_j))
 
     return once(job, STEP, VERSION, [*keys, *known], parameters, make)
 
 
-def _motion(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried, Carried]) -> Made:
+def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried, Carried] = ((), ())) -> Made:
+    """Motion between two extracted images; their laser may be left out, which leaves its length open.
+
+    carried : entries of the laser images that sound for either, with navigation's step to them.
+    """
     if "feature_uv" not in a.arrays or "feature_uv" not in b.arrays:
         return Made({}, {"model": "", "matches": 0, "inliers": 0})
     ranges = [range_m for range_m in (a.info["range_m"], b.info["range_m"]) if range_m]

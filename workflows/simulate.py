@@ -195,7 +195,7 @@ def _make(scene: Scene, seed: int) -> _Made:
 def _half_m(scene: Scene, camera: Camera, poses: Cameras) -> float:
     """Half the side of a square that holds all that the cameras see."""
     drop = scene.terrain.slope_drop_m if scene.terrain.kind == "pool" else 3 * scene.terrain.relief_m
-    farthest = scene.survey.altitude_m + drop + 0.2
+    farthest = scene.survey.highest_m + drop + 0.2
     # a few degrees more than the corner's, for the vehicle's roll and pitch
     corner = np.arctan(np.hypot(*normalised(camera, outline(camera, 5), farthest).T)).max() + np.radians(4)
     return float(abs(poses.C_local[:, :2]).max() + farthest * np.tan(corner) + 0.2)

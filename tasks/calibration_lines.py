@@ -1,0 +1,104 @@
+"""Two crossing lines of light on a flat thing, told apart without any calibration."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.calibration import Camera, LaserPlane
+from ..schemas.parameters import LaserParameters
+from . import laser
+from .camera import normalised
+
+Array = NDArray[np.float64]
+
+_TRIALS = 400
+_NEAR_PX = 4.0
+_APART_WIDTHS = 8.0
+_MIN_POINTS = 30
+
+
+class Lines(NamedTuple):
+    """Laser points on the arms of a cross.
+
+    Attributes
+    ----------
+    uv : (N, 2) pixels. arm : (N,) which sheet. sigma_px : (N,) 1-sigma of u.
+    """
+
+    uv: Array
+    arm: NDArray[np.int8]
+    sigma_px: Array
+
+
+def no_lines() -> Lines:
+    """Nothing found."""
+    return Lines(np.zeros((0, 2)), np.zeros(0, np.int8), np.zeros(0))
+
+
+def rising(sheet: LaserPlane) -> bool:
+    """Whether the sheet's line on level ground goes down to the right in the image (y grows with x)."""
+    return -sheet.normal[0] / sheet.normal[1] > 0
+
+
+def cross_on_flat(
+    image_bgr: NDArray[np.uint8], camera: Camera, sheets: tuple[LaserPlane, LaserPlane], parameters: LaserParameters
+) -> Lines:
+    """The two lines of a cross on a flat surface.
+
+    Of the sheets only the direction in which each leans is used, so they may be wrong by many degrees. The lines are
+    straight in slopes x/z, y/z (slightly bent behind a flat port); what is off them, and the crossing itself, is left.
+
+    Parameters
+    ----------
+    image_bgr : (H, W, 3) uint8.
+    """
+    points = laser.detect(image_bgr, parameters)
+    if len(points.uv) < _MIN_POINTS:
+        return no_lines()
+    x = normalised(camera, points.uv) * camera.fx
+    found = [_line(x, down_right, np.random.default_rng(0)) for down_right in (True, False)]
+    curves = [None if keep is None else _curve(x, keep) for keep in found]
+    first, second = curves
+    if first is None or second is None:
+        return no_lines()
+    width = float(np.median(points.width_px))
+    apart = np.abs(first(x[:, 1]) - second(x[:, 1])) > max(_APART_WIDTHS * width, 8.0 * points.step_px)
+    arm = np.full(len(x), -1, np.int8)
+    for curve, down_right in ((first, True), (second, False)):
+        off = np.abs(x[:, 0] - curve(x[:, 1]))
+        near = off < _NEAR_PX
+        spread = 1.4826 * float(np.median(off[near])) if near.any() else 0.0
+        own = 0 if rising(sheets[0]) == down_right else 1
+        arm[(off < max(4 * spread, 0.5)) & apart] = own
+    told = arm >= 0
+    return Lines(points.uv[told], arm[told], points.sigma_px[told])
+
+
+def _line(x: Array, down_right: bool, rng: np.random.Generator) -> NDArray[np.bool_] | None:
+    """Points (N,) on the line with most points that leans the given way, by RANSAC; None where there is none."""
+    a, b = rng.integers(0, len(x), (2, _TRIALS))
+    d = x[b] - x[a]
+    far = np.hypot(*d.T) > 20 * _NEAR_PX
+    leans = (d[:, 0] * d[:, 1] > 0) == down_right
+    steep = np.abs(d[:, 1]) > 0.1 * np.abs(d[:, 0])
+    a, d = a[far & leans & steep], d[far & leans & steep]
+    if not len(a):
+        return None
+    slope = d[:, 0] / d[:, 1]
+    off = np.abs(x[:, :1] - x[a, 0] - (x[:, 1:] - x[a, 1]) * slope) / np.hypot(1, slope)
+    best = int((off < _NEAR_PX).sum(0).argmax())
+    keep = off[:, best] < _NEAR_PX
+    return keep if keep.sum() >= _MIN_POINTS else None
+
+
+def _curve(x: Array, keep: NDArray[np.bool_]) -> np.polynomial.Polynomial:
+    """x as a quadratic function of y, refitted to what is near it."""
+    for _ in range(4):
+        curve = np.polynomial.Polynomial.fit(x[keep, 1], x[keep, 0], 2)
+        off = np.abs(x[:, 0] - curve(x[:, 1]))
+        near = keep & (off < max(4 * 1.4826 * float(np.median(off[keep])), 0.5))
+        if near.sum() < _MIN_POINTS:
+            break
+        keep = near
+    return np.polynomial.Polynomial.fit(x[keep, 1], x[keep, 0], 2)

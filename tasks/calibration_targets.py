@@ -1,0 +1,161 @@
+"""What a picture of a board shows: its corners, and the lines of light on it or beside it."""
+
+from typing import Final, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..schemas.parameters import LaserParameters
+from . import laser
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+_NEAR_PX: Final = 3.0
+_MIN_POINTS: Final = 40
+_TRIALS: Final = 1500
+_DICTIONARY: Final = "DICT_4X4_50"
+
+
+class Board(NamedTuple):
+    """A flat target.
+
+    Attributes
+    ----------
+    kind : chessboard or charuco. columns, rows : inner corners of a chessboard, squares of a ChArUco board.
+    square_m : side of a square. marker_share : side of a ChArUco marker over that of a square.
+    dictionary : of its markers, as OpenCV names it.
+    """
+
+    kind: Literal["chessboard", "charuco"]
+    columns: int
+    rows: int
+    square_m: float
+    marker_share: float = 0.75
+    dictionary: str = _DICTIONARY
+
+
+class Light(NamedTuple):
+    """Points of lines of light. uv (N, 2) pixels, sheet (N,) number of the line, sigma_px (N,)."""
+
+    uv: Array
+    sheet: NDArray[np.intp]
+    sigma_px: Array
+
+
+def corners(grey: Grey, board: Board) -> tuple[Array, Array] | None:
+    """Corners on the board (N, 3), metres, and in the image (N, 2), pixels; None where the board is not found.
+
+    Parameters
+    ----------
+    grey : (H, W) uint8. Brightness is stretched first, since a laser's glare leaves the board in the dark.
+    """
+    bright = max(float(np.percentile(grey, 85)), 1.0)
+    stretched = np.clip(grey.astype(np.float32) * (200 / bright), 0, 255).astype(np.uint8)
+    if board.kind == "charuco":
+        return _charuco(grey, board)
+    for image in (stretched, grey):
+        found = _chessboard(image, (board.columns, board.rows))
+        if found is not None:
+            y, x = np.mgrid[: board.rows, : board.columns]
+            flat = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * board.square_m
+            return flat.astype(np.float64), found
+    return None
+
+
+def _chessboard(image: Grey, size: tuple[int, int]) -> Array | None:
+    done, found = cv2.findChessboardCorners(image, size, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_FAST_CHECK)
+    if not done:
+        done, found = cv2.findChessboardCorners(image, size, flags=cv2.CALIB_CB_ADAPTIVE_THRESH)
+    if not done:
+        done, found = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)
+        return np.asarray(found, np.float64).reshape(-1, 2) if done else None
+    grid = np.asarray(found, np.float64).reshape(size[1], size[0], 2)
+    spacing = min(np.hypot(*np.diff(grid, axis=axis).reshape(-1, 2).T).min() for axis in (0, 1))
+    half = int(np.clip(0.35 * spacing, 2, 15))
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
+    return np.asarray(cv2.cornerSubPix(image, found, (half, half), (-1, -1), criteria), np.float64).reshape(-1, 2)
+
+
+def _charuco(image: Grey, board: Board) -> tuple[Array, Array] | None:
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    marker = board.marker_share * board.square_m
+    target = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_m, marker, dictionary)
+    found, ids, _, _ = cv2.aruco.CharucoDetector(target).detectBoard(image)
+    if ids is None or len(ids) < 8:
+        return None
+    flat = np.asarray(target.getChessboardCorners(), np.float64)[np.ravel(np.asarray(ids)).astype(np.intp)]
+    return flat, np.asarray(found, np.float64).reshape(-1, 2)
+
+
+def outline(corner_uv: Array, grow: float) -> Array:
+    """Polygon (M, 2) around a board's corners, grown from their middle by a share of its size."""
+    hull = cv2.convexHull(np.ascontiguousarray(corner_uv, np.float32)).reshape(-1, 2).astype(np.float64)
+    return hull.mean(0) + (1 + grow) * (hull - hull.mean(0))
+
+
+def inside(uv: Array, polygon: Array) -> NDArray[np.bool_]:
+    """Which points (N,) lie in a convex polygon (M, 2)."""
+    shape = np.ascontiguousarray(polygon, np.float32).reshape(-1, 1, 2)
+    return np.array([cv2.pointPolygonTest(shape, (float(u), float(v)), False) >= 0 for u, v in uv], bool)
+
+
+def parallel_lines(image_bgr: NDArray[np.uint8], allowed: Array | None, count: int, p: LaserParameters) -> Light:
+    """Points of `count` lines that run from top to bottom without crossing, numbered from the left.
+
+    Parameters
+    ----------
+    image_bgr : (H, W, 3) or (H, W) uint8.
+    allowed : polygon (M, 2) outside which the light lies, or None.
+
+    Returns
+    -------
+    Light, empty where another number of lines was found.
+    """
+    points = laser.detect(image_bgr, p)
+    keep = np.ones(len(points.uv), bool) if allowed is None else ~inside(points.uv, allowed)
+    uv, sigma = points.uv[keep], points.sigma_px[keep]
+    lines = straight_lines(uv, count)
+    if len(lines) != count:
+        return Light(np.zeros((0, 2)), np.zeros(0, np.intp), np.zeros(0))
+    sheet = np.full(len(uv), -1, np.intp)
+    middle = float(np.median(np.concatenate([uv[own, 1] for own in lines])))
+    order = sorted(lines, key=lambda own: float(np.polyval(np.polyfit(uv[own, 1], uv[own, 0], 1), middle)))
+    for number, own in enumerate(order):
+        sheet[own] = number
+    told = sheet >= 0
+    return Light(uv[told], sheet[told], sigma[told])
+
+
+def straight_lines(uv: Array, count: int) -> list[NDArray[np.intp]]:
+    """Indices of the points on each of the `count` lines with most points, by RANSAC one after the other."""
+    rng, left, found = np.random.default_rng(0), np.arange(len(uv)), []
+    while len(found) < count and len(left) >= _MIN_POINTS:
+        x = uv[left]
+        a, b = rng.integers(0, len(x), (2, _TRIALS))
+        d = x[b] - x[a]
+        far = np.abs(d[:, 1]) > 10 * _NEAR_PX
+        if not far.any():
+            break
+        slope = d[far, 0] / d[far, 1]
+        near = np.abs(x[:, :1] - x[a[far], 0] - (x[:, 1:] - x[a[far], 1]) * slope) < _NEAR_PX
+        best = near[:, int(near.sum(0).argmax())]
+        if best.sum() < _MIN_POINTS:
+            break
+        own = _tightened(x, best)
+        found.append(left[own])
+        wide = np.abs(x[:, 0] - np.polyval(np.polyfit(x[own, 1], x[own, 0], 2), x[:, 1])) < 3 * _NEAR_PX
+        left = left[~(wide | own)]
+    return found
+
+
+def _tightened(x: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Points (N,) near the quadratic curve through those of a line."""
+    for _ in range(4):
+        off = np.abs(x[:, 0] - np.polyval(np.polyfit(x[keep, 1], x[keep, 0], 2), x[:, 1]))
+        near = off < max(4 * 1.4826 * float(np.median(off[keep])), 0.5)
+        if near.sum() < _MIN_POINTS:
+            break
+        keep = near
+    return keep

@@ -1,0 +1,90 @@
+"""`seamosaic calibrate` from the command line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from seamosaic.schemas.problems import InvalidInput
+from seamosaic.tasks.calibration_sheets import altitude_error
+from seamosaic.workflows.calibrate_inputs import read_calibration
+from seamosaic.workflows.cli import app
+from typer.testing import CliRunner
+
+from tests.simulated import small_mission
+from tests.tasks.calibration_scenes import wrong
+
+
+def start_of(mission: Path, folder: Path) -> Path:
+    """A starting calibration one degree and 20 mm wrong."""
+    path = folder / "start.yaml"
+    off = wrong(read_calibration(mission / "calibration.yaml"))
+    path.write_text(yaml.safe_dump(off.model_dump(mode="json", exclude_none=True)))
+    return path
+
+
+def worst_percent(mission: Path, found: Path, altitude_m: float) -> float:
+    true, other = (read_calibration(path).laser for path in (mission / "calibration.yaml", found))
+    assert true is not None
+    assert other is not None
+    camera = read_calibration(mission / "calibration.yaml").camera
+    pairs = zip(true.sheets, other.sheets, strict=True)
+    errors = [
+        altitude_error(camera, np.array([*a.normal, a.offset]), np.array([*b.normal, b.offset]), altitude_m)
+        for a, b in pairs
+    ]
+    return 100 * max(abs(e) for e in errors) / altitude_m
+
+
+def test_flat(tmp_path: Path):
+    survey = {"lines": 3, "altitude_m": 1.8, "altitude_step_m": 0.6, "overlap": 0.4, "sidelap": 0.6}
+    mission = small_mission(tmp_path / "floor", "floor", images=12, survey=survey)
+    start, out = start_of(mission, tmp_path), tmp_path / "out"
+    done = CliRunner().invoke(app, ["calibrate", "flat", str(mission), "--start", str(start), "-o", str(out)])
+    assert done.exit_code == 0, done.output
+    assert worst_percent(mission, start, 2.4) > 0.3
+    assert worst_percent(mission, out / "calibration.yaml", 2.4) < 0.25
+    (block,) = read_calibration(out / "calibration.yaml").covariance
+    assert "laser.planes.a.normal.x" in block.parameters
+    assert "mount.rotation.roll" in block.parameters
+    assert np.linalg.eigvalsh(np.array(block.matrix)).min() > -1e-12
+    page = (out / "calibration-report.html").read_text()
+    assert "Leave-one-out" in page
+    assert page.count("data:image/png") == 3
+    assert "http" not in page.replace("http-equiv", "")
+    with pytest.raises(InvalidInput, match="never overwritten"):
+        CliRunner().invoke(app, ["calibrate", "flat", str(mission), "-o", str(out)], catch_exceptions=False)
+
+
+def test_no_board_is_said(tmp_path: Path):
+    arguments = ["calibrate", "board", str(tmp_path), "-o", str(tmp_path / "out"), "--lines", "1"]
+    arguments += ["--columns", "9", "--rows", "6", "--square-mm", "30"]
+    with pytest.raises(InvalidInput, match="no images"):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+
+def test_a_cross_needs_a_start(tmp_path: Path):
+    arguments = ["calibrate", "board", str(tmp_path), "-o", str(tmp_path / "out")]
+    arguments += ["--columns", "9", "--rows", "6", "--square-mm", "30"]
+    with pytest.raises(InvalidInput, match="--start"):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+
+def test_a_mission_without_navigation_is_refused(tiny_mission: Path, tmp_path: Path):
+    text = (tiny_mission / "mission.yaml").read_text()
+    (tiny_mission / "mission.yaml").write_text(text[: text.index("navigation:")])
+    with pytest.raises(InvalidInput, match="navigation"):
+        CliRunner().invoke(
+            app, ["calibrate", "field", str(tiny_mission), "-o", str(tmp_path / "o")], catch_exceptions=False
+        )
+
+
+@pytest.mark.slow
+def test_field(tmp_path: Path):
+    mission = small_mission(tmp_path / "reef", "reef", images=24, width=1216, survey={"lines": 3})
+    start, out = start_of(mission, tmp_path), tmp_path / "out"
+    done = CliRunner().invoke(app, ["calibrate", "field", str(mission), "--start", str(start), "-o", str(out)])
+    assert done.exit_code == 0, done.output
+    assert worst_percent(mission, start, 2.7) > 0.5
+    assert worst_percent(mission, out / "calibration.yaml", 2.7) < 0.4
+    assert "time_offset" in (out / "calibration-report.html").read_text()

@@ -1,0 +1,272 @@
+"""What calibrations take from a mission: images, lines of light, navigation and matches."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..catalog.images import UnreadableImage, read_image
+from ..catalog.interpolation import smoothed
+from ..catalog.mission_files import MissionFiles
+from ..catalog.mission_inputs import read_inputs
+from ..catalog.missions import OpenedMission, open_mission
+from ..catalog.store import Entry, Store
+from ..schemas.calibration import Calibration, Mount
+from ..schemas.parameters import Parameters
+from ..schemas.problems import InvalidInput, Problem
+from ..schemas.yaml_input import load_model
+from ..tasks import features, laser, navigation, triangulation
+from ..tasks.calibration_field import Matches, Points, Track
+from ..tasks.calibration_flat import FlatData, gather
+from ..tasks.calibration_lines import Lines, cross_on_flat, no_lines
+from ..tasks.rotations import R_vehicle_camera
+from . import match, plan
+from .job import Job, log
+
+SMOOTH_S = 1.5
+_RATE_STEP_S = 0.25
+_NEAR_S = 3.0
+_POINTS_AN_ARM = 300
+
+
+def read_calibration(path: Path) -> Calibration:
+    """A calibration.yaml.
+
+    Raises
+    ------
+    InvalidInput
+        It cannot be read, or what is wrong with it.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        found = error.strerror or str(error)
+        problem = Problem(str(path), None, "", found, "a calibration.yaml", "Correct the path.")
+        raise InvalidInput([problem]) from error
+    return load_model(content, str(path), Calibration)
+
+
+class Survey(NamedTuple):
+    """A mission to calibrate from.
+
+    Attributes
+    ----------
+    url : as given. opened, plan : the mission, its navigation smoothed. rows : (n,) usable images.
+    """
+
+    url: str
+    opened: OpenedMission
+    made: plan.Plan
+    rows: NDArray[np.intp]
+
+
+def open_survey(url: str, start: Calibration | None, laser_only: bool, level_floor: bool) -> Survey:
+    """Open a mission with navigation, its calibration replaced by `start` if given.
+
+    Raises
+    ------
+    InvalidInput
+        The mission is wrong, has no navigation or no laser.
+    """
+    opened = open_mission(url, hashed=False, smooth_s=SMOOTH_S, level_floor=level_floor)
+    if start is not None:
+        opened = opened._replace(calibration=start)
+    problems = []
+    if opened.crs is None:
+        remedy = "Add navigation to mission.yaml, or calibrate with a board."
+        problems.append(Problem(f"{url}/mission.yaml", 1, "navigation", "none", "navigation", remedy))
+    if opened.calibration.laser is None:
+        remedy = "Add laser to the calibration to start from: baseline, angle and roll by tape measure will do."
+        problems.append(Problem(f"{url}/{opened.mission.calibration}", 1, "laser", "none", "a laser", remedy))
+    if problems:
+        raise InvalidInput(problems)
+    made = plan.plan(opened, Parameters())
+    wanted = [image.row for image in made.images if not laser_only or image.role != "texture"]
+    return Survey(url, opened, made, np.array(wanted, np.intp))
+
+
+def spread(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """At most so many rows, evenly spread."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int))]
+
+
+def _read(survey: Survey, row: int) -> NDArray[np.uint8] | None:
+    path = str(survey.opened.frames["image"].values[row])
+    try:
+        return read_image(survey.url, path, survey.opened.calibration.camera).bgr
+    except UnreadableImage as error:
+        log.warning("step=calibrate image=%s rejected: %s", path, error)
+        return None
+
+
+def flat_lines(survey: Survey, parameters: Parameters) -> list[Lines]:
+    """Both lines of each image on a flat floor."""
+    calibration = survey.opened.calibration
+    assert calibration.laser is not None
+    sheets = calibration.laser.sheets
+
+    def one(row: int) -> Lines:
+        bgr = _read(survey, row)
+        return no_lines() if bgr is None else cross_on_flat(bgr, calibration.camera, sheets, parameters.laser)
+
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(one, survey.rows.tolist()))
+
+
+def _reference(survey: Survey) -> tuple[NDArray, NDArray]:
+    """R_local_vehicle (n, 3, 3) and navigation reference points (n, 3) of the survey's rows, local frame."""
+    prior, mount = survey.made.prior, survey.opened.calibration.mount
+    assert prior is not None
+    R = prior.poses.R_local_camera[survey.rows] @ R_vehicle_camera(*mount.rotation).T
+    return R, prior.poses.C_local[survey.rows] - R @ np.asarray(mount.translation)
+
+
+def flat_data(surveys: list[Survey], lines: list[list[Lines]]) -> FlatData:
+    """Points and navigation of one mission or more, images with both lines only."""
+    parts = []
+    for number, (survey, found) in enumerate(zip(surveys, lines, strict=True)):
+        R, X = _reference(survey)
+        prior = survey.made.prior
+        assert prior is not None
+        keep = np.array([len(one.uv) > 0 for one in found], bool) & np.isfinite(X).all(1)
+        altitude = survey.opened.frames["altitude"].values.astype(float)[survey.rows]
+        tilt = prior.sigma_attitude[survey.rows][:, :2].mean(1)
+        # each mission has a local frame of its own, and a floor of its own
+        columns = R, X, altitude, np.full(len(X), number), prior.sigma_depth[survey.rows], tilt
+        parts.append(([one for one, ok in zip(found, keep, strict=True) if ok], [c[keep] for c in columns]))
+    told = [one for one_mission, _ in parts for one in one_mission]
+    if len(told) < 4:
+        found = f"{len(told)} images with both lines"
+        remedy = "Check that the laser was on and the floor is flat; look at the images."
+        raise InvalidInput([Problem(surveys[0].url, None, "images", found, "at least 4", remedy)])
+    uv, image, arm, sigma = gather(told)
+    return FlatData(uv, image, arm, sigma, *[np.concatenate(c) for c in zip(*[c for _, c in parts], strict=True)])
+
+
+def _reference_at(survey: Survey, opened: OpenedMission) -> tuple[NDArray, NDArray]:
+    """As `_reference`, by another navigation but in the same local frame."""
+    names = "longitude", "latitude", "elevation", "roll", "pitch", "heading"
+    state = navigation.VehicleState(*(opened.frames[name].values.astype(float)[survey.rows] for name in names))
+    poses = navigation.camera_poses(state, Mount(), survey.made.frame)
+    return poses.R_local_camera @ R_vehicle_camera(0, 0, 0).T, poses.C_local
+
+
+# ------------------------------------------------------------------------------------------------ survey
+
+
+def track(survey: Survey, parameters: Parameters) -> Track:
+    """Navigation of the survey's rows and how fast it changes."""
+    prior = survey.made.prior
+    assert prior is not None
+    R, X = _reference(survey)
+    sides = []
+    for sign in (-1, 1):
+        shifted = open_mission(survey.url, hashed=False, smooth_s=SMOOTH_S, shift_s=sign * _RATE_STEP_S)
+        sides.append(_reference_at(survey, shifted))
+    turn = np.einsum("nji,njk->nik", sides[0][0], sides[1][0])
+    rate = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
+    step = 2 * _RATE_STEP_S
+    return Track(
+        R,
+        X,
+        np.nan_to_num(0.5 * rate / step),
+        np.nan_to_num((sides[1][1] - sides[0][1]) / step),
+        prior.time_s[survey.rows],
+        prior.sigma_horizontal[survey.rows],
+        prior.sigma_depth[survey.rows],
+        prior.sigma_attitude[survey.rows],
+        parameters.adjust.drift_m_per_sqrt_s,
+    )
+
+
+def altimeter(survey: Survey) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Every reading of the altimeter: the image (S,) nearest in time and the foot (S, 3) from its reference point."""
+    problems: list[Problem] = []
+    inputs = read_inputs(MissionFiles(survey.url), problems)
+    mission, samples = inputs.mission, inputs.navigation
+    assert mission is not None
+    assert mission.navigation is not None
+    assert samples is not None
+    slow = smoothed(samples, SMOOTH_S)
+    frames = survey.opened.frames
+    start = frames["time"].values[survey.rows].astype(np.int64)
+    ns = samples.ns + round(mission.navigation.time_offset * 1e9)
+    known = np.isfinite(samples.altitude) & np.isfinite(slow.depth) & np.isfinite(slow.latitude)
+    ns, altitude = ns[known], samples.altitude[known]
+    image = np.abs(ns[:, None] - start[None]).argmin(1)
+    near = np.abs(ns - start[image]) < _NEAR_S * 1e9
+    image, ns, altitude = image[near], ns[near], altitude[near]
+    frame = survey.made.frame
+    place = [getattr(slow, name)[known][near] for name in ("longitude", "latitude", "depth")]
+    X = frame.local_from_geographic(place[0], place[1], -place[2])
+    at = [
+        np.interp(start * 1e-9 - start[0] * 1e-9, (ns - start[0]) * 1e-9, column) for column in X.T
+    ]  # tides and offsets cancel in the difference
+    foot = X - np.column_stack(at)[image]
+    foot[:, 2] -= altitude
+    return image.astype(np.intp), foot
+
+
+def soundings(survey: Survey, calibration: Calibration, parameters: Parameters) -> Points:
+    """Laser points of the survey's rows with the arms as a calibration tells them."""
+    light = calibration.laser
+    assert light is not None
+
+    def one(row: int) -> triangulation.Soundings:
+        bgr = _read(survey, row)
+        if bgr is None:
+            return triangulation.no_soundings()
+        return triangulation.sound(bgr, calibration.camera, light, parameters.laser).soundings
+
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(one, survey.rows.tolist()))
+    parts = []
+    for k, s in enumerate(found):
+        for arm in (0, 1):
+            own = np.flatnonzero(s.arm == arm)
+            own = own[np.argsort(s.uv[own, 1], kind="stable")][:: max(1, len(own) // _POINTS_AN_ARM)]
+            parts.append((s.uv[own], np.full(len(own), k), np.full(len(own), arm, np.int8)))
+    uv, image, arm = (np.concatenate(field) for field in zip(*parts, strict=True))
+    return Points(uv, image.astype(np.intp), arm, np.full(len(uv), 0.3))
+
+
+def matches(survey: Survey, parameters: Parameters, scratch: Path) -> Matches:
+    """Matches of all overlapping pairs of the survey's rows, by feature and epipolar geometry: no laser is asked."""
+    calibration, made = survey.opened.calibration, survey.made
+    job = Job(survey.url, survey.opened.mission.id, Store(str(scratch)), calibration, parameters)
+    chosen = {image.row: k for k, image in enumerate([i for i in made.images if i.row in set(survey.rows.tolist())])}
+    of_survey = made._replace(images=tuple(image for image in made.images if image.row in chosen))
+    tasks = plan.first_pairs(of_survey, survey.opened, parameters)
+    needed = sorted({row for task in tasks for row in (task.i, task.j)})
+    with ThreadPoolExecutor(2) as pool:
+        entries = dict(zip(needed, pool.map(lambda row: _entry(survey, row, parameters), needed), strict=True))
+        found = list(pool.map(lambda task: match.between(job, task, entries[task.i], entries[task.j]), tasks))
+    number = {int(row): k for k, row in enumerate(survey.rows)}
+    linked = [(task, made_) for task, made_ in zip(tasks, found, strict=True) if made_.info["model"]]
+    if not linked:
+        none = np.zeros(0, np.intp)
+        return Matches(none, none, np.zeros((0, 2)), np.zeros((0, 2)))
+    sizes = [len(made_.arrays["uv_i"]) for _, made_ in linked]
+    return Matches(
+        np.repeat([number[task.i] for task, _ in linked], sizes).astype(np.intp),
+        np.repeat([number[task.j] for task, _ in linked], sizes).astype(np.intp),
+        np.concatenate([made_.arrays["uv_i"] for _, made_ in linked]).astype(float),
+        np.concatenate([made_.arrays["uv_j"] for _, made_ in linked]).astype(float),
+    )
+
+
+def _entry(survey: Survey, row: int, parameters: Parameters) -> Entry:
+    """Features of an image, away from whatever looks like laser light."""
+    bgr = _read(survey, row)
+    info: dict[str, Any] = {"range_m": None, "status": ""}
+    if bgr is None:
+        return Entry({"feature_uv": np.zeros((0, 2)), "feature_descriptors": np.zeros((0, 128), np.uint8)}, info)
+    points = laser.detect(bgr, parameters.laser)
+    width = float(np.median(points.width_px)) if len(points.uv) else 1.0
+    erase = laser.mask(bgr.shape[:2], points.uv, 3.3 * width)
+    grey = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+    found = features.detect(grey, erase, parameters.features)
+    return Entry({"feature_uv": found.uv, "feature_descriptors": found.descriptors}, info)
