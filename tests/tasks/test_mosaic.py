@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from seamosaic.tasks import grids, mosaic
+from seamosaic.tasks import grids, mosaic, nodes
 from seamosaic.tasks.frames import LocalAffine, MapFrame
 from seamosaic.tasks.grids import Grid
 from seamosaic.tasks.terrain import Terrain
 
+from tests.tasks import seabed
 from tests.tasks.seabed import CAMERA, pattern, photograph, pose
 
 SAME = LocalAffine(np.eye(3), np.zeros(3))
@@ -27,11 +28,13 @@ def terrain_of(height, tile=TILE, halo_m=0.5, cell_m=0.02, local=SAME):
     return Terrain(height(*grids.cell_centres(grid)) if callable(height) else np.full(grid.shape, height), grid, local)
 
 
+def plan_of(tile, terrain, views, feather_m=0.02, **options):
+    shots = [(seabed.shot_of(view), nodes.lie(terrain.local, *view[3:5])) for view in views]
+    return mosaic.plan(tile, nodes.ground(tile, terrain), shots, feather_m=feather_m, **options)
+
+
 def compose(tile, terrain, views, feather_m=0.02):
-    canvas = mosaic.start(tile, terrain, feather_m)
-    for view in views:
-        canvas = mosaic.add_view(canvas, view)
-    return mosaic.finish(canvas)
+    return seabed.compose([plan_of(tile, terrain, views, feather_m)], views)[0]
 
 
 def truth(tile, origin=(0.0, 0.0)):
