@@ -35,15 +35,15 @@ from .nodes import (
     quality_cost,
     quality_scale,
     see,
+    small_at,
     upsample,
 )
-from .projection import look_up
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Pixels = NDArray[np.uint8]
-Tone = Callable[[int, Array32, Array32, Array32], tuple[Array32, Array32]]
+Tone = Callable[[Array32, Array32, Array32], tuple[Array32, Array32]]
 Read = Callable[[int, int], Pixels]
 
 FEATHER_M: Final = 0.02
@@ -118,8 +118,8 @@ def plan(
 ) -> Plan:
     """Which image is shown where, from shots in the order of their numbers.
 
-    tone(number, u, v, range_m) gives gain and veil (..., 3) at pixels u, v and distance range_m (...) of an image:
-    light is multiplied with the one, less the other. None: colours as they were taken.
+    tone(u, v, range_m) gives gain and veil (..., 3) at an image's pixels u, v and distance range_m (...): light is
+    multiplied with the one, less the other. None: colours as they were taken.
     """
     found = [(shot, see(place, shot, lie, feather_m)) for shot, lie in shots]
     views = [(shot, seen) for shot, seen in found if seen is not None]
@@ -256,22 +256,13 @@ def _tones(
         if not parts:
             result.append((None, None))
             continue
-        gain, veil = tone(shot.number, seen.u, seen.v, seen.range_m)
+        gain, veil = tone(seen.u, seen.v, seen.range_m)
         if shot.thumbnail is not None:
-            own = np.maximum(_thumbnail_at(shot, seen), _DARKEST)
+            own = np.maximum(small_at(shot.thumbnail, shot.camera, seen.u, seen.v), _DARKEST)
             ratio = np.clip(even[_part(place, seen)] / own, 1 / _MOST_EVENED, _MOST_EVENED).astype(np.float32)
             gain, veil = gain * ratio, veil * ratio
         result.append((np.nan_to_num(gain), np.nan_to_num(veil)))
     return result
-
-
-def _thumbnail_at(shot: Shot, seen: Seen) -> Array32:
-    """Colours (rows, columns, 3) of an image's thumbnail at the nodes."""
-    assert shot.thumbnail is not None
-    rows, columns = shot.thumbnail.shape[:2]
-    u = np.nan_to_num((seen.u.ravel() + 0.5) * np.float32(columns / shot.camera.width) - 0.5)
-    v = np.nan_to_num((seen.v.ravel() + 0.5) * np.float32(rows / shot.camera.height) - 0.5)
-    return look_up(shot.thumbnail, u.astype(np.float32), v.astype(np.float32)).reshape(*seen.u.shape, 3)
 
 
 def _thumbnails_blended(place: Ground, views: Sequence[tuple[Shot, Seen]], best: Array32, feather_m: float) -> Array32:
@@ -284,7 +275,7 @@ def _thumbnails_blended(place: Ground, views: Sequence[tuple[Shot, Seen]], best:
         with np.errstate(invalid="ignore", over="ignore"):
             weight = np.exp(-np.maximum(seen.cost - best[at], 0) / (_WIDE_FEATHERS * feather_m)) * _from_rim(shot, seen)
         weight = np.nan_to_num(weight).astype(np.float32) + np.float32(1e-12)
-        total[at] += _thumbnail_at(shot, seen) * weight[..., None]
+        total[at] += small_at(shot.thumbnail, shot.camera, seen.u, seen.v) * weight[..., None]
         weights[at] += weight
     return (total / np.maximum(weights, 1e-12)[..., None]).astype(np.float32)
 
@@ -364,7 +355,9 @@ def _finish(made: Plan, total: Array32, gamma: float) -> Mosaic:
     rgb = np.empty((3, *source.shape), np.uint8)
     for row in range(0, len(light), BLOCK):  # what is worked on stays in the processor's cache
         rows = slice(row, row + BLOCK)
-        rgb[:, rows] = [levels.take(np.asarray(band), mode="wrap") for band in cv2.split(_as_16_bits(light[rows]))]
+        rgb[:, rows] = [
+            levels.take(np.asarray(band, np.uint16), mode="wrap") for band in cv2.split(_as_16_bits(light[rows]))
+        ]
     return Mosaic(rgb, source >= 0, np.ascontiguousarray(source))
 
 

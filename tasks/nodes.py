@@ -247,6 +247,15 @@ def _quality_around(place: Ground, shot: Shot, u: Array32, v: Array32, range_m: 
     return look_up(np.asarray(lowest), flat[0], flat[1], beyond=OUTSIDE).reshape(u.shape)
 
 
+def small_at(small: Array32, camera: Camera, u: Array32, v: Array32) -> Array32:
+    """Values (..., 3) of a small picture (rows, columns, 3) of an image at its pixels u, v (...)."""
+    rows, columns = small.shape[:2]
+    at = [
+        ((w.ravel() + 0.5) * (n / size) - 0.5) for w, n, size in ((u, columns, camera.width), (v, rows, camera.height))
+    ]
+    return look_up(small, *(np.nan_to_num(w).astype(np.float32) for w in at)).reshape(*u.shape, 3)
+
+
 def _blocks_seen(place: Ground, camera: Camera, lie: Lie) -> Grid | None:
     """The blocks with every pixel that the image can see, from its outline on lowest and highest ground."""
     if not np.isfinite(place.z).any():

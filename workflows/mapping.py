@@ -39,7 +39,7 @@ def map_tiles(state: Session, posed: products.Posed) -> products.Mapped:
     outlines = _outlines(state, posed.solution, ranges)
     surface_tiles = _surface(state, m, posed, images, outlines, cell)
     textured = [image for image in images if image.texture]
-    light = _lighting(state, textured)
+    light = _lighting(state, m, textured)
     mosaic = _mosaics(state, m, textured or images, outlines, surface_tiles, mosaic_cell, light, posed)
     return products.Mapped(m, cell, mosaic_cell, surface_tiles, mosaic, outlines)
 
@@ -144,12 +144,12 @@ def _surface(
     return products.Tiles(grid, tuple(zip(tiles, surfaces, strict=True)))
 
 
-def _lighting(state: Session, images: Sequence[Image]) -> Done | None:
+def _lighting(state: Session, m: MapJob, images: Sequence[Image]) -> Done | None:
     if state.job.parameters.mosaic.colour == "none" or not images:
         return None
     state.ledger.begin(mosaics.LIGHTING)
     every = max(1, len(images) // _LIGHTING_IMAGES)
-    task = delayed(mosaics.lighting)(state.job, list(images[::every]), dask_key_name="lighting")
+    task = delayed(mosaics.lighting)(m, list(images[::every]), dask_key_name="lighting")
     (light,) = compute(state, mosaics.LIGHTING, [task])
     state.ledger.end(mosaics.LIGHTING, [light])
     return light

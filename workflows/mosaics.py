@@ -7,7 +7,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..tasks import camera, colour, frames, laser, mosaic, nodes, planar, terrain
+from ..schemas.calibration import Camera
+from ..tasks import camera, colour, frames, laser, mosaic, nodes, planar, terrain, water
 from ..tasks.frames import MapFrame
 from ..tasks.grids import Grid
 from ..tasks.navigation import Poses
@@ -19,17 +20,29 @@ from .solve import Solution
 
 LIGHTING, ALIGN, MOSAIC = "lighting", "planar-align", "mosaic"
 _VERSION = code_version(sys.modules[__name__])
-_GAMMA = 2.2
 
 
-def lighting(job: Job, images: Sequence[Image]) -> Done:
-    """The mission's mean lighting from the thumbnails of some of its images."""
+def lighting(m: MapJob, images: Sequence[Image]) -> Done:
+    """What lamps and water do to the mission's colours, from the thumbnails of some of its images."""
+    poses = solve.solution(load(m.job, solve.STEP, m.adjusted)).poses
+    gamma = m.job.parameters.mosaic.gamma
 
     def make() -> Made:
-        thumbnails = [load(job, extract.STEP, image.key, ("thumbnail",)).arrays["thumbnail"] for image in images]
-        return Made({"pattern": colour.lighting(np.stack(thumbnails))}, {"images": len(images)})
+        light, away, exact = zip(*(_small(m.job, image, poses) for image in images), strict=True)
+        return Made(water.fit(np.stack(light), np.stack(away), np.stack(exact))._asdict(), {"images": len(images)})
 
-    return once(job, LIGHTING, _VERSION, [image.key for image in images], [], make)
+    heights = [(image.range_m, *np.round(poses.R_local_camera[image.row, 2], 6)) for image in images]
+    parameters = [gamma, *stage(m.job.calibration.camera), heights]
+    return once(m.job, LIGHTING, _VERSION, [image.key for image in images], parameters, make)
+
+
+def _small(job: Job, image: Image, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """An image's thumbnail as light, red green blue, how far away its cells are, and where this is known well."""
+    arrays = load(job, extract.STEP, image.key, ("thumbnail", "laser_uv", "laser_X")).arrays
+    uv, X = arrays.get("laser_uv", np.zeros((0, 2))), arrays.get("laser_X", np.zeros((0, 3)))
+    down = -poses.R_local_camera[image.row, 2]
+    away, exact = colour.ranges(job.calibration.camera, down, image.range_m, uv.astype(float), X.astype(float))
+    return colour.as_light(arrays["thumbnail"][..., ::-1], job.parameters.mosaic.gamma), away, exact
 
 
 def _inputs(tile: Tile, solution: Solution) -> list[str]:
@@ -86,8 +99,10 @@ def mosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], alig
     inputs = [*_inputs(tile, solution), *(done.key for _, done in ground), aligned.key, light.key if light else ""]
 
     def make() -> Made:
-        shots = [_shot(m.job, image, light) for image in tile.images]
-        tone = _tone(m.job, light)
+        model = _model(m.job, light)
+        small = [model and _thumbnail(m.job, image, solution.poses, model) for image in tile.images]
+        shots = [_shot(m.job, image, thumbnail) for image, thumbnail in zip(tile.images, small, strict=True)]
+        tone = _tone(m.job.calibration.camera, model) if model else None
         both = _on_surface(m, tile, ground, solution.poses), _on_plane(m, tile, aligned, solution.poses)
         plans = [
             mosaic.plan(tile.grid, place, [(shot, lies[shot.number]) for shot in shots], tone) for place, lies in both
@@ -99,7 +114,7 @@ def mosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], alig
             return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
 
         cv2.setNumThreads(1)
-        ortho, flat = mosaic.compose(plans, read, times, _GAMMA if light else 1.0)
+        ortho, flat = mosaic.compose(plans, read, times, m.job.parameters.mosaic.gamma if light else 1.0)
         arrays = {**ortho._asdict(), "planar_rgb": flat.rgb, "planar_mask": flat.mask}
         return Made(arrays, {"pixels": int(ortho.mask.sum())})
 
@@ -137,9 +152,9 @@ def _affine(frame: MapFrame, tile: Grid, elevation: np.ndarray) -> frames.LocalA
     return frame.affine_at(np.array([(west + east) / 2, (south + north) / 2, z]))
 
 
-def _shot(job: Job, image: Image, light: Done | None) -> Shot:
+def _shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
     """An image without its pixels: which of them the laser lights, and its colours in small."""
-    entry = load(job, extract.STEP, image.key, ("line_uv", "thumbnail"))
+    entry = load(job, extract.STEP, image.key, ("line_uv",))
     lens = job.calibration.camera
     scale = nodes.quality_scale(lens)
     shape = -(-lens.height // scale), -(-lens.width // scale)
@@ -147,13 +162,29 @@ def _shot(job: Job, image: Image, light: Done | None) -> Shot:
     if "line_uv" in entry.arrays:
         line = np.unique(np.round((entry.arrays["line_uv"] + 0.5) / scale - 0.5), axis=0)
         erase = laser.mask(shape, line, entry.info["halfwidth_px"] / scale + 0.5)
-    return Shot(image.row, lens, nodes.qualities(erase, scale), None)
+    return Shot(image.row, lens, nodes.qualities(erase, scale), thumbnail)
 
 
-def _tone(job: Job, light: Done | None) -> mosaic.Tone | None:
+def _model(job: Job, light: Done | None) -> water.Water | None:
     if light is None:
         return None
-    return None
+    a = load(job, LIGHTING, light.key).arrays
+    scalars = {name: a[name].item() for name in ("spreading", "range_m")}
+    return water.Water(light=a["light"], attenuation=a["attenuation"], veil=a["veil"], balance=a["balance"], **scalars)
+
+
+def _thumbnail(job: Job, image: Image, poses: Poses, model: water.Water) -> np.ndarray:
+    """An image's thumbnail without what lamps and water do."""
+    small, away, _ = _small(job, image, poses)
+    gain, veil = water.tone(model, model.light, away)
+    return water.without_holes(small * gain - veil)
+
+
+def _tone(lens: Camera, model: water.Water) -> mosaic.Tone:
+    def tone(u: np.ndarray, v: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return water.tone(model, nodes.small_at(model.light, lens, u, v), range_m)
+
+    return tone
 
 
 VERSIONS = dict.fromkeys((LIGHTING, ALIGN, MOSAIC), _VERSION)
