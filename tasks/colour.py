@@ -17,6 +17,7 @@ Pixels = NDArray[np.uint8]
 THUMBNAIL: Final = (24, 32)  # rows, columns
 _SHRINK: Final = 8
 _KNOWN: Final = 0.1
+_LEAN: Final = 0.02  # error of a point's depth over the seabed's slope, and its points' share in what is independent
 _NEAR: Final = 0.15  # share of the depth that a cell's laser points may be off the plane of all
 
 
@@ -60,11 +61,9 @@ def ranges(camera: Camera, down: Array, height_m: float, laser_uv: Array, laser_
     if len(laser_X) < 3:
         away = height_m / np.maximum(direction @ down, 0.1)
         return away.reshape(THUMBNAIL).astype(np.float32), np.ones(THUMBNAIL, bool)
-    # of a plane the inverse depth is linear in the slopes
-    slopes, nearness = np.column_stack([laser_X[:, :2] / laser_X[:, 2:], np.ones(len(laser_X))]), 1 / laser_X[:, 2]
-    plane = np.linalg.lstsq(slopes, nearness, rcond=None)[0]
+    plane = _plane(laser_X, down)
+    typical = float(np.median(1 / laser_X[:, 2]))
     own = direction / direction[:, 2:]
-    typical = float(np.median(nearness))
     depth = 1 / np.clip(own @ plane, 0.5 * typical, 2 * typical)
     cell = np.clip((laser_uv + 0.5) / (camera.width, camera.height) * (columns, rows), 0, (columns - 1, rows - 1))
     cell = cell[:, 1].astype(int) * columns + cell[:, 0].astype(int)
@@ -73,3 +72,15 @@ def ranges(camera: Camera, down: Array, height_m: float, laser_uv: Array, laser_
     exact = (count > 0) & (np.abs(mean - depth) < _NEAR * depth)
     away = np.where(exact, mean, depth) / direction[:, 2]
     return away.reshape(THUMBNAIL).astype(np.float32), exact.reshape(THUMBNAIL)
+
+
+def _plane(X: Array, down: Array) -> Array:
+    """(3,): the inverse depth of a plane near points X (N, 3), linear in the slopes X/Z, Y/Z, 1.
+
+    Where the points do not say how it leans, as along one arm of the laser, it is level.
+    """
+    slopes, nearness = np.column_stack([X[:, :2] / X[:, 2:], np.ones(len(X))]), 1 / X[:, 2]
+    level = down * np.median(nearness / (slopes @ down))
+    weight = _LEAN * np.sqrt(len(X)) * np.eye(3)
+    found = np.linalg.lstsq(np.vstack([slopes, weight]), np.append(nearness, weight @ level), rcond=None)
+    return np.asarray(found[0])

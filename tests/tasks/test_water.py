@@ -80,3 +80,65 @@ def test_a_grey_target_stays_grey_from_two_to_four_metres(tint, grey):
     )
     assert np.quantile(before, 0.5) > 15
     assert 0.01 < np.quantile(error, 0.95) < 4
+
+
+def test_the_strobe_leaves_no_pattern_and_the_seabed_is_not_taken_for_light():
+    rng = np.random.default_rng(1)
+    model = water.fit(*survey(rng, rng.uniform(2.5, 2.9, 80)))
+    range_m = ranges_of(np.full(40, 2.7), rng, 0.03)
+    raw = through_water(np.full(3, 0.4), range_m)
+    found = corrected(model, raw, range_m)
+    falloff = [np.ptp(image.mean(0)[..., 1]) / image[..., 1].mean() for image in (raw, found)]
+    assert falloff[0] > 0.2
+    assert 1e-4 < np.abs(found.mean(0) / found.mean((0, 1, 2)) - 1).mean() < 0.03
+    chequer = np.kron(np.tile([[0.3, 0.5], [0.5, 0.3]], (6, 8)), np.ones((2, 2)))
+    tiles = corrected(model, through_water(chequer[..., None] * np.ones(3), range_m), range_m)
+    bright, dark = (tiles[:, chequer == albedo].mean() for albedo in (0.5, 0.3))
+    assert bright / dark == pytest.approx(5 / 3, rel=0.08)  # a veil left in would have made it less
+
+
+def test_the_laser_leaves_no_trace():
+    rng = np.random.default_rng(2)
+    light, range_m, exact = survey(rng, rng.uniform(2.5, 2.9, 40))
+    clean = water.fit(light, range_m, exact)
+    covered = np.zeros(light.shape[1:3], bool)
+    covered[11:13] = True  # in every image
+    masked = water.fit(np.where(covered[..., None], np.nan, light).astype(np.float32), range_m, exact)
+    spoilt = water.fit(np.where(covered[..., None], [0.1, 0.9, 0.1], light).astype(np.float32), range_m, exact)
+    assert np.isfinite(masked.light).all()
+    assert 0 < np.abs(np.log(masked.light / clean.light)).max() < 0.12
+    assert np.abs(np.log(spoilt.light / clean.light)).max() > 0.3
+
+
+@pytest.mark.parametrize("tint", [(0.5, 0.5, 0.5), (0.25, 0.38, 0.2), (0.6, 0.5, 0.35)], ids=["road", "grass", "sand"])
+def test_photographs_in_air_keep_their_colours(tint):
+    rng = np.random.default_rng(3)
+    range_m = ranges_of(rng.uniform(90, 110, 18), rng)
+    shade = np.exp(rng.normal(0, 0.15, range_m.shape) - 0.3 * (SLOPES**2).sum(-1))
+    light = (shade[..., None] * np.array(tint) * np.exp(rng.normal(0, 0.05, (*range_m.shape, 3)))).astype(np.float32)
+    model = water.fit(light, range_m, np.ones(range_m.shape, bool))
+    road = np.broadcast_to(np.float32(0.3), light.shape)
+    found = corrected(model, road, range_m)
+    assert np.ptp(np.log(found), axis=-1).max() < 0.02  # grey stays grey
+    assert 1e-3 < np.log(found[..., 1]).std() < 0.1
+
+
+def test_dark_corners_are_not_blown_up():
+    model = water.Water(np.full((24, 32, 3), 1e-4, np.float32), np.zeros(3), 0.0, np.zeros(3), 3.0, np.ones(3))
+    gain, veil = water.tone(model, model.light, np.full((24, 32), 3.0, np.float32))
+    assert (gain == gain[0, 0, 0]).all()
+    assert 4 < gain[0, 0, 0] < 100
+    assert (veil == 0).all()
+
+
+def test_an_unlit_or_lone_image_is_left_nearly_as_it_is():
+    rng = np.random.default_rng(4)
+    light, range_m, exact = survey(rng, [2.7])
+    for image, known in ((light, exact), (light, np.zeros_like(exact)), (np.zeros_like(light), exact)):
+        model = water.fit(image, range_m, known)
+        gain, veil = water.tone(model, model.light, range_m)
+        assert np.isfinite(gain).all()
+        assert np.isfinite(veil).all()
+    few = water.fit(light, range_m, exact).light
+    many = water.fit(*survey(rng, rng.uniform(2.6, 2.8, 40))).light
+    assert np.log(few).std() < 0.6 * np.log(many).std()
