@@ -2,8 +2,8 @@
 
     python benchmarks/maps.py [--images 20] [--folder FOLDER]
 
-Simulates a mission of 10-megapixel images with a ground sample distance of 1 mm (kept in FOLDER for the next time), maps
-it on one core with a mosaic of 2 mm, and prints a line of JSON.
+Simulates a mission of 10-megapixel images with a ground sample distance of 1 mm (kept in FOLDER for the next time),
+maps it on one core with a mosaic of 2 mm, and prints a line of JSON.
 """
 
 import argparse

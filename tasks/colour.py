@@ -83,4 +83,4 @@ def _plane(X: Array, down: Array) -> Array:
     level = down * np.median(nearness / (slopes @ down))
     weight = _LEAN * np.sqrt(len(X)) * np.eye(3)
     found = np.linalg.lstsq(np.vstack([slopes, weight]), np.append(nearness, weight @ level), rcond=None)
-    return np.asarray(found[0])
+    return found[0].astype(np.float64)
