@@ -193,6 +193,8 @@ def see(place: Ground, shot: Shot, lie: Lie, feather_m: float) -> Seen | None:
     nodes = _grids(part, place.step)[1]
     first = row * BLOCK // place.step, column * BLOCK // place.step
     at = slice(first[0], first[0] + nodes.height), slice(first[1], first[1] + nodes.width)
+    if not np.isfinite(place.z[at]).any():
+        return None
     x, y = axes(nodes)
     X, Y, Z = (lie.A[k, 2] * place.z[at] + (lie.A[k, 0] * x + lie.b[k]) + lie.A[k, 1] * y[:, None] for k in range(3))
     u, v = _pixels_or_nan(table, X, Y, Z)

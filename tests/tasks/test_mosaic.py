@@ -189,6 +189,11 @@ def test_holes_in_the_surface_and_images_elsewhere_leave_nothing():
     hole = (x > west) & (x < east) & (y > south) & (y < north)
     assert not result.mask[hole].any()
     assert result.mask[(x < west - 0.03)].mean() > 0.95
+    x, _ = grids.cell_centres(terrain.grid)
+    half = Terrain(np.where(x < -0.3, terrain.elevation, np.nan), terrain.grid, SAME)
+    wide = Grid(CELL, -100, 90, 600, 180)
+    over_nothing = view._replace(C_local=view.C_local + np.array([2.6, 0, 0]), number=1)
+    assert {laid.shot.number for laid in plan_of(wide, half, [view, over_nothing]).laid} == {0}
     nothing = compose(TILE, Terrain(np.full_like(terrain.elevation, np.nan), terrain.grid, SAME), [view])
     assert not nothing.mask.any()
 
