@@ -87,11 +87,10 @@ def fit(light: Array32, range_m: Array32, exact: Mask) -> Water:
         pattern = _pattern(light, share, law)
         law = _fit_law(light / np.exp(pattern), share, exact)
     wet = _in_water(law.colour)
-    grey = pattern.mean(-1, keepdims=True)
     balance = np.exp(wet * _white(law))
     balance *= np.exp(law.colour).mean() / (np.exp(law.colour) * balance).mean()
     return Water(
-        np.exp(grey + wet * (pattern - grey)).astype(np.float32),
+        np.exp(wet * pattern).astype(np.float32),
         wet * law.attenuation,
         wet * law.spreading,
         wet * law.veil,

@@ -117,10 +117,18 @@ def test_photographs_in_air_keep_their_colours(tint):
     shade = np.exp(rng.normal(0, 0.15, range_m.shape) - 0.3 * (SLOPES**2).sum(-1))
     light = (shade[..., None] * np.array(tint) * np.exp(rng.normal(0, 0.05, (*range_m.shape, 3)))).astype(np.float32)
     model = water.fit(light, range_m, np.ones(range_m.shape, bool))
-    road = np.broadcast_to(np.float32(0.3), light.shape)
-    found = corrected(model, road, range_m)
-    assert np.ptp(np.log(found), axis=-1).max() < 0.02  # grey stays grey
-    assert 1e-3 < np.log(found[..., 1]).std() < 0.1
+    gain, veil = water.tone(model, model.light, range_m)
+    assert (veil == 0).all()
+    np.testing.assert_allclose(gain, 1, atol=1e-5)
+    gain, _ = water.tone(*lost_red(light, range_m))
+    assert np.median(gain[..., 0] / gain[..., 1]) > 1.5
+
+
+def lost_red(light, range_m):
+    """The same, of a water that takes red."""
+    seen = (light * np.array([0.2, 1, 1])).astype(np.float32)
+    model = water.fit(seen, range_m, np.ones(range_m.shape, bool))
+    return model, model.light, range_m
 
 
 def test_dark_corners_are_not_blown_up():
