@@ -9,7 +9,7 @@ not change with the brightness of the seabed.
 """
 
 import warnings
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -33,6 +33,8 @@ _LEAST_SIGNAL: Final = 0.2
 # sigmas of what is believed without data: attenuation over the median range, exponent of spreading, the veil's share
 _PRIOR_ATTENUATION, _PRIOR_SPREADING, _PRIOR_VEIL = 3.0, 1.0, 0.2
 _LEAST_SIGMA, _LEAST_SIGMA_RATIO, _LEAST_SIGMA_CONTRAST = 0.02, 0.003, 0.05
+_DARK_SHARE: Final = 0.08
+_SIGMA_DARK: Final = 0.005
 _SIGMA_SEABED: Final = 0.12  # of the logarithm of a seabed's red or blue over its green
 _SIGMA_CAMERA: Final = 0.06  # of a camera's own white balance
 _SIGMA_WAY: Final = 0.4  # share of the attenuation, because the veil over it is not known well
@@ -85,7 +87,7 @@ def fit(light: Array32, range_m: Array32, exact: Mask) -> Water:
     pattern = np.zeros(light.shape[1:])
     for _ in range(_ROUNDS):
         pattern = _pattern(light, share, law)
-        law = _fit_law(light / np.exp(pattern), share, exact)
+        law = _fit_law(light, pattern, share, exact)
     wet = _in_water(law.colour)
     balance = np.exp(wet * _white(law))
     balance *= np.exp(law.colour).mean() / (np.exp(law.colour) * balance).mean()
@@ -129,8 +131,9 @@ def _pattern(light: Array32, share: Array32, law: _Law) -> Array:
     return few * (pattern - pattern.mean((0, 1))).astype(np.float64)
 
 
-def _fit_law(even: Array, share: Array32, exact: Mask) -> _Law:
+def _fit_law(light: Array32, pattern: Array, share: Array32, exact: Mask) -> _Law:
     """How light (n, rows, columns, 3) without its pattern changes with the range."""
+    even, dim = light / np.exp(pattern), np.broadcast_to(np.exp(-pattern), light.shape)
     known = exact & np.isfinite(even).all(-1)
     x, y = share[known].astype(float), np.log(np.maximum(even[known], _DARKEST))
     image = np.nonzero(known)[0]
@@ -138,19 +141,20 @@ def _fit_law(even: Array, share: Array32, exact: Mask) -> _Law:
         colour = _median(np.log(np.maximum(even, _DARKEST)), axis=(0, 1, 2))
         return _Law(colour, np.zeros(3), 0.0, np.zeros(3), np.full(2, _PRIOR_ATTENUATION))
     edges = np.quantile(x, np.linspace(0, 1, _BINS + 1)[1:-1])
-    bins = [_bin(x[here], y[here], image[here]) for here in _members(np.digitize(x, edges))]
-    at, level, ratio, contrast, count = (np.array(column) for column in zip(*bins, strict=True))
+    bins = [_bin(x[here], y[here], dim[known][here], image[here]) for here in _members(np.digitize(x, edges))]
+    at, level, ratio, contrast, dimmed, dark, count = (np.array(column) for column in zip(*bins, strict=True))
     sigma = [_spread(values, count, least) for values, least in ((level, _LEAST_SIGMA), (ratio, _LEAST_SIGMA_RATIO))]
     mean = _median(y, axis=0)
 
     def off(p: Array) -> Array:
         colour, attenuation, spreading, veil, clarity = p[:3], p[3:6], p[6], np.exp(mean) * p[7:10], p[10]
         signal = np.exp(colour) * _signal(at[:, None], attenuation, spreading)
-        both = np.log(np.maximum(signal + _veil(at[:, None], veil), 1e-9))
+        both = np.log(np.maximum(signal + _veil(at[:, None], veil) * dimmed, 1e-9))
         parts = [
             (level[:, 0] - both[:, _GREEN]) / sigma[0],
             (ratio[..., 0] - (both[:, (0, 2)] - both[:, [_GREEN]])) / sigma[1],
             (contrast - clarity - np.log(np.maximum(signal, 1e-9)) + both) / (_LEAST_SIGMA_CONTRAST),
+            _off_dark(dark, signal, _veil(at[:, None], veil) * dimmed) / _SIGMA_DARK,
             attenuation / _PRIOR_ATTENUATION,
             np.array([(spreading - 1) / _PRIOR_SPREADING]),
             p[7:10] / _PRIOR_VEIL,
@@ -169,17 +173,28 @@ def _fit_law(even: Array, share: Array32, exact: Mask) -> _Law:
     return _Law(p[:3], p[3:6], float(p[6]), np.exp(mean) * p[7:10], sigma_ratio)
 
 
+def _off_dark(dark: Array, signal: Array, veil: Array) -> Array:
+    """What the ratios (bins, 2) of the darkest cells are off those of as dark a seabed that is as grey as the rest."""
+    left = np.exp(dark[:, :1]) - veil[:, [_GREEN]]
+    share = np.maximum(left / signal[:, [_GREEN]], 0.01)
+    expected = np.log(np.maximum(share * signal + veil, 1e-9))
+    return dark[:, 1:] - (expected[:, (0, 2)] - expected[:, [_GREEN]])
+
+
 def _members(bins: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     found = [np.flatnonzero(bins == k) for k in range(_BINS)]
     return [here for here in found if len(here) >= _LEAST_IN_BIN // 4]
 
 
-def _bin(x: Array, y: Array, image: NDArray[np.intp]) -> tuple[float, Array, Array, Array, int]:
-    """Of a bin: range; green and its scatter; ratios (2, 2) and theirs; log contrast (3,); number of images."""
+def _bin(x: Array, y: Array, dim: Array, image: NDArray[np.intp]) -> tuple[Any, ...]:
+    """Of a bin: range; green and its scatter; ratios (2, 2) and theirs; log contrast (3,); how much more the veil
+    counts where the lamps give less (3,); green and the ratios of its darkest cells (3,); number of images."""
     green, ratio = y[:, _GREEN], y[:, (0, 2)] - y[:, [_GREEN]]
     level = np.array([np.median(green), _scatter(green)])
+    darkest = green <= np.quantile(green, _DARK_SHARE)
+    dark = np.append(np.median(green[darkest]), np.median(ratio[darkest], axis=0))
     ratios = np.stack([np.median(ratio, axis=0), _scatter(ratio)], axis=-1)
-    return float(np.median(x)), level, ratios, np.log(_scatter(y) + 1e-6), len(np.unique(image))
+    return float(np.median(x)), level, ratios, np.log(_scatter(y) + 1e-6), dim.mean(0), dark, len(np.unique(image))
 
 
 def _scatter(values: Array) -> Array:
