@@ -160,7 +160,9 @@ def _shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
     shape = -(-lens.height // scale), -(-lens.width // scale)
     erase = np.zeros(shape, bool)
     if "line_uv" in entry.arrays:
-        line = np.unique(np.round((entry.arrays["line_uv"] + 0.5) / scale - 0.5), axis=0)
+        u, v = np.floor((entry.arrays["line_uv"] + 0.5) / scale).astype(int).T
+        erase[np.clip(v, 0, shape[0] - 1), np.clip(u, 0, shape[1] - 1)] = True
+        line = np.argwhere(erase)[:, ::-1].astype(float)  # each pixel once
         erase = laser.mask(shape, line, entry.info["halfwidth_px"] / scale + 0.5)
     return Shot(image.row, lens, nodes.qualities(erase, scale), thumbnail)
 
