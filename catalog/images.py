@@ -1,7 +1,7 @@
 """Decoded images."""
 
 import io
-from typing import NamedTuple, cast
+from typing import Final, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -39,7 +39,16 @@ class DecodedImage(NamedTuple):
     sha256: str
 
 
-def read_image(mission: str, image: str, camera: Camera) -> DecodedImage:
+_JPEG: Final = b"\xff\xd8"
+_REDUCED: Final = {
+    1: cv2.IMREAD_COLOR,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+    8: cv2.IMREAD_REDUCED_COLOR_8,
+}
+
+
+def read_image(mission: str, image: str, camera: Camera, reduce: int = 1) -> DecodedImage:
     """Read and decode one image of a mission.
 
     Parameters
@@ -47,6 +56,7 @@ def read_image(mission: str, image: str, camera: Camera) -> DecodedImage:
     mission : folder or URL.
     image : path in it.
     camera : whose size the image must have.
+    reduce : as in `decode`.
 
     Raises
     ------
@@ -58,28 +68,37 @@ def read_image(mission: str, image: str, camera: Camera) -> DecodedImage:
         content = cast(bytes, fs.cat_file(f"{root.rstrip('/')}/{image}"))
     except OSError as error:
         raise UnreadableImage(f"file cannot be read ({error.strerror or error})") from None
-    return DecodedImage(decode(content, camera), sha256(content))
+    return DecodedImage(decode(content, camera, reduce), sha256(content))
 
 
-def decode(content: bytes, camera: Camera) -> NDArray[np.uint8]:
+def decode(content: bytes, camera: Camera, reduce: int = 1) -> NDArray[np.uint8]:
     """Decode the bytes of a JPEG, PNG or TIFF file into BGR, uint8 (rows, cols, 3).
 
     16 bits a channel become 8. The EXIF rotation is not applied: calibrations are of the sensor. What OpenCV
     would fill with grey (a truncated JPEG) is refused. Raises UnreadableImage.
+
+    reduce : 1, 2, 4 ...: rows and columns so many times fewer, rounded up, each pixel the mean of those that it
+        stands for; of a JPEG the rest is never decoded.
     """
     fault = read_header(content[:HEADER_BYTES], content[-TAIL_BYTES:], io.BytesIO(content)).fault
     if fault:
         raise UnreadableImage(fault)
+    in_file = min(reduce, max(_REDUCED)) if content[:2] == _JPEG else 1
     try:
-        bgr = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        bgr = cv2.imdecode(np.frombuffer(content, np.uint8), _REDUCED[in_file] | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         bgr = None
     if bgr is None:
         raise UnreadableImage("file is damaged (it cannot be decoded)")
-    fault = size_fault(bgr.shape[1], bgr.shape[0], camera)
-    if fault:
-        raise UnreadableImage(fault)
+    if bgr.shape[:2] != _reduced(camera, in_file):
+        raise UnreadableImage(size_fault(bgr.shape[1] * in_file, bgr.shape[0] * in_file, camera))
+    if reduce > in_file:
+        bgr = cv2.resize(bgr, _reduced(camera, reduce)[::-1], interpolation=cv2.INTER_AREA)
     return np.asarray(bgr, np.uint8)
+
+
+def _reduced(camera: Camera, times: int) -> tuple[int, int]:
+    return -(-camera.height // times), -(-camera.width // times)
 
 
 def size_fault(width: int, height: int, camera: Camera) -> str:

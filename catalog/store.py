@@ -12,7 +12,7 @@ import os
 import threading
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import fsspec
@@ -20,7 +20,7 @@ import numpy as np
 from fsspec.implementations.local import LocalFileSystem
 from numpy.typing import NDArray
 
-_INFO = "info.json"
+_INFO, _ARRAY = "info.json", ".npy"
 _UNREADABLE = (FileNotFoundError, zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError)
 
 
@@ -49,12 +49,17 @@ class Store(NamedTuple):
     def path(self, step: str, key: str) -> str:
         return f"{self.url}/{step}/{key[:2]}/{key}.npz"
 
-    def get(self, step: str, key: str) -> Entry | None:
-        """The result, or None when there is none or it is damaged."""
+    def get(self, step: str, key: str, names: Collection[str] | None = None) -> Entry | None:
+        """The result, or None when there is none or it is damaged.
+
+        names : arrays that are wanted, of those that it has; nothing else is read. None: all.
+        """
         filesystem, path = fsspec.url_to_fs(self.path(step, key))
         try:
             with filesystem.open(path, "rb") as file:
-                return _unpack(file.read())
+                if names is None:  # at one go, as object stores like it
+                    return _unpack(io.BytesIO(file.read()), None)
+                return _unpack(file, names)
         except _UNREADABLE:
             return None
 
@@ -74,9 +79,17 @@ class Store(NamedTuple):
             filesystem.rm_file(path)
 
     def put(
-        self, step: str, key: str, arrays: Mapping[str, NDArray], info: Mapping[str, Any], compress: bool = False
+        self,
+        step: str,
+        key: str,
+        arrays: Mapping[str, NDArray],
+        info: Mapping[str, Any],
+        compress: bool | Collection[str] = False,
     ) -> None:
-        """Store a result whole, under its final name only when all of it is written."""
+        """Store a result whole, under its final name only when all of it is written.
+
+        compress : all arrays, none, or the names of those that are worth it.
+        """
         filesystem, path = fsspec.url_to_fs(self.path(step, key))
         data = _pack(arrays, info, compress)
         if isinstance(filesystem, LocalFileSystem):
@@ -93,23 +106,26 @@ class Store(NamedTuple):
             filesystem.pipe_file(path, data)
 
 
-def _pack(arrays: Mapping[str, NDArray], info: Mapping[str, Any], compress: bool) -> bytes:
+def _pack(arrays: Mapping[str, NDArray], info: Mapping[str, Any], compress: bool | Collection[str]) -> bytes:
     buffer = io.BytesIO()
-    method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
-    with zipfile.ZipFile(buffer, "w", method, compresslevel=1) as archive:
+    squeezed = compress if not isinstance(compress, bool) else arrays if compress else ()
+    with zipfile.ZipFile(buffer, "w") as archive:
         archive.writestr(_INFO, json.dumps(dict(info)))
         for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+            method = zipfile.ZIP_DEFLATED if name in squeezed else zipfile.ZIP_STORED
+            archive.writestr(f"{name}{_ARRAY}", member.getbuffer(), method, compresslevel=1)
     return buffer.getvalue()
 
 
-def _unpack(data: bytes) -> Entry:
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+def _unpack(file: Any, names: Collection[str] | None) -> Entry:
+    with zipfile.ZipFile(file) as archive:
         info = json.loads(archive.read(_INFO))
+        known = [name.removesuffix(_ARRAY) for name in archive.namelist() if name != _INFO]
         arrays = {
-            name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(archive.read(name)), allow_pickle=False)
-            for name in archive.namelist()
-            if name != _INFO
+            name: np.lib.format.read_array(io.BytesIO(archive.read(f"{name}{_ARRAY}")), allow_pickle=False)
+            for name in known
+            if names is None or name in names
         }
     return Entry(arrays, info)

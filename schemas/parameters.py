@@ -109,10 +109,14 @@ class MosaicParameters(Model):
     cell_m: Annotated[
         Annotated[float, Field(gt=0)] | Literal["auto"], Field(description="metres; auto: max(0.002, GSD)")
     ] = "auto"
-    tile_cells: Annotated[int, Field(ge=256, le=16384)] = 2048
+    tile_cells: Annotated[int, Field(ge=256, le=16384)] = 3072
     colour: Annotated[
-        Literal["flatfield", "none"], Field(description="flatfield: the mission's mean lighting is removed")
+        Literal["flatfield", "none"],
+        Field(description="flatfield: lamps' lighting and the water's colour are removed; none: pixels as taken"),
     ] = "flatfield"
+    gamma: Annotated[
+        float, Field(ge=1, le=3, description="of the images: level = light ** (1 / gamma); colours are mixed as light")
+    ] = 2.2
 
 
 class MeshParameters(Model):

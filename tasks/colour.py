@@ -1,73 +1,86 @@
-"""Flat-fielding: the mission's mean lighting is measured on small pictures of its images and divided out.
+"""Small pictures of images, as light, and how far away what they show is."""
 
-Lamps that travel with the camera, falloff towards the corners and water between lamp, seabed and lens light every
-image in the same pattern; the seabed differs from image to image. So the median over images is the light.
-"""
-
-import warnings
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..schemas.calibration import Camera
+from .camera import rays
+
+Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 Pixels = NDArray[np.uint8]
 
 THUMBNAIL: Final = (24, 32)  # rows, columns
-_MOST_GAIN: Final = 4.0
-_BALANCE: Final = 0.5  # share of the way, in logarithms, from the light's own colour to grey
-_SMOOTH_CELLS: Final = 1.0
-_DARKEST: Final = 1.0
+_SHRINK: Final = 8
+_KNOWN: Final = 0.1
+_LEAN: Final = 0.02  # error of a point's depth over the seabed's slope, and its points' share in what is independent
+_NEAR: Final = 0.15  # share of the depth that a cell's laser points may be off the plane of all
 
 
-def thumbnail(image: Pixels, mask: NDArray[np.bool_]) -> Array32:
+def thumbnail(image: Pixels, mask: Mask) -> Array32:
     """Means (24, 32, 3) of an image (H, W, 3) over its unmasked pixels; NaN where nearly all are masked."""
     size = THUMBNAIL[::-1]
-    kept = (~mask).astype(np.float32)
-    weight = cv2.resize(kept, size, interpolation=cv2.INTER_AREA)[..., None]
-    total = cv2.resize(image.astype(np.float32) * kept[..., None], size, interpolation=cv2.INTER_AREA)
-    return np.where(weight > 0.1, total / np.maximum(weight, 0.1), np.nan).astype(np.float32)
+    kept = np.asarray(cv2.copyTo(image, (~mask).astype(np.uint8), np.zeros_like(image)))
+    weight = (~mask).astype(np.float32)
+    shrink = min(_SHRINK, image.shape[1] // THUMBNAIL[1], image.shape[0] // THUMBNAIL[0])
+    if shrink > 1:
+        smaller = image.shape[1] // shrink, image.shape[0] // shrink
+        kept, weight = (
+            np.asarray(cv2.resize(layer, smaller, interpolation=cv2.INTER_AREA)) for layer in (kept, weight)
+        )
+    weight = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)[..., None]
+    total = cv2.resize(kept.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.where(weight > _KNOWN, total / np.maximum(weight, _KNOWN), np.nan).astype(np.float32)
 
 
-def lighting(thumbnails: Array32) -> Array32:
-    """Gain (24, 32, 3) that makes the mission evenly lit, from thumbnails (n, 24, 32, 3) of its images.
+def as_light(levels: NDArray, gamma: float) -> Array32:
+    """Light 0..1 of levels 0..255: level = light ** (1 / gamma)."""
+    return ((np.asarray(levels, np.float32) / np.float32(255)) ** np.float32(gamma)).astype(np.float32)
 
-    Each image's own brightness is taken out before the median over images, so a dark seabed under half of the
-    images leaves no trace. The gain keeps the mission's mean brightness; its colour goes half of the way to grey,
-    for full grey would raise the noise of the red that water takes.
+
+def ranges(camera: Camera, down: Array, height_m: float, laser_uv: Array, laser_X: Array) -> tuple[Array32, Mask]:
+    """Distance (24, 32) of the middle of a thumbnail's cells, and where it is known well.
+
+    With laser points by their plane, and where some lie in a cell by these; without by level ground.
+
+    Parameters
+    ----------
+    down : (3,) the vertical, camera frame.
+    height_m : of the camera above the ground.
+    laser_uv : (N, 2) pixels of laser points. laser_X : (N, 3) their places, camera frame, m.
     """
-    light = np.log(np.maximum(thumbnails, _DARKEST))
-    level = _median(light, axis=(1, 2), keepdims=True)
-    pattern = _without_holes(_median(light - level, axis=0))
-    pattern = cv2.GaussianBlur(pattern, (0, 0), _SMOOTH_CELLS, borderType=cv2.BORDER_REPLICATE)
-    colour = _median(level, axis=0).reshape(3)
-    target = colour + _BALANCE * (np.log(np.exp(colour).mean()) - colour)
-    brightness = np.log(np.exp(pattern).mean((0, 1)))
-    return np.exp(target - colour + brightness - pattern).astype(np.float32)
+    rows, columns = THUMBNAIL
+    u, v = np.meshgrid(
+        (np.arange(columns) + 0.5) * camera.width / columns, (np.arange(rows) + 0.5) * camera.height / rows
+    )
+    direction = rays(camera, np.column_stack([u.ravel(), v.ravel()]) - 0.5).direction
+    if len(laser_X) < 3:
+        away = height_m / np.maximum(direction @ down, 0.1)
+        return away.reshape(THUMBNAIL).astype(np.float32), np.ones(THUMBNAIL, bool)
+    plane = _plane(laser_X, down)
+    typical = float(np.median(1 / laser_X[:, 2]))
+    own = direction / direction[:, 2:]
+    depth = 1 / np.clip(own @ plane, 0.5 * typical, 2 * typical)
+    cell = np.clip((laser_uv + 0.5) / (camera.width, camera.height) * (columns, rows), 0, (columns - 1, rows - 1))
+    cell = cell[:, 1].astype(int) * columns + cell[:, 0].astype(int)
+    count = np.bincount(cell, minlength=rows * columns)
+    mean = np.bincount(cell, laser_X[:, 2], rows * columns) / np.maximum(count, 1)
+    exact = (count > 0) & (np.abs(mean - depth) < _NEAR * depth)
+    away = np.where(exact, mean, depth) / direction[:, 2]
+    return away.reshape(THUMBNAIL).astype(np.float32), exact.reshape(THUMBNAIL)
 
 
-def _median(values: Array32, axis: int | tuple[int, ...], keepdims: bool = False) -> Array32:
-    """Median of what is not NaN; NaN where all is."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "All-NaN slice")
-        return np.nanmedian(values, axis=axis, keepdims=keepdims)
+def _plane(X: Array, down: Array) -> Array:
+    """(3,): the inverse depth of a plane near points X (N, 3), linear in the slopes X/Z, Y/Z, 1.
 
-
-def _without_holes(pattern: Array32) -> Array32:
-    """NaN of a (24, 32, 3) pattern, where the laser stands in every image, filled from around."""
-    known = np.isfinite(pattern).astype(np.float32)
-    filled, sigma = np.nan_to_num(pattern), 1.0
-    while not known.all() and sigma < max(THUMBNAIL):
-        weight = cv2.GaussianBlur(known, (0, 0), sigma)
-        mean = cv2.GaussianBlur(filled * known, (0, 0), sigma) / np.maximum(weight, 1e-6)
-        reached = (known == 0) & (weight > 1e-3)
-        filled, known = np.where(reached, mean, filled), np.maximum(known, reached)
-        sigma *= 2
-    return filled.astype(np.float32)
-
-
-def flatten(image: Pixels, gain: Array32) -> Pixels:
-    """The image (H, W, 3) evenly lit by a gain (24, 32, 3) of `lighting`, at most fourfold."""
-    full = cv2.resize(np.minimum(gain, _MOST_GAIN), image.shape[1::-1], interpolation=cv2.INTER_CUBIC)
-    return np.clip(np.rint(image * full), 0, 255).astype(np.uint8)
+    Where the points do not say how it leans, as along one arm of the laser, it is level.
+    """
+    slopes, nearness = np.column_stack([X[:, :2] / X[:, 2:], np.ones(len(X))]), 1 / X[:, 2]
+    level = down * np.median(nearness / (slopes @ down))
+    weight = _LEAN * np.sqrt(len(X)) * np.eye(3)
+    found = np.linalg.lstsq(np.vstack([slopes, weight]), np.append(nearness, weight @ level), rcond=None)
+    return found[0].astype(np.float64)

@@ -1,14 +1,19 @@
-"""Orthomosaic of one tile: the surface textured from the image whose centre is closest (paper IV).
+"""Mosaic of one tile: the ground textured from the image whose centre is closest (paper IV), in two passes.
 
-A tile is begun with `start`, given its images one at a time with `add_view`, and ended with `finish`; it holds no
-image. Each image is given a cost in each cell: metres from the cell to the image's optical axis, more at the
-image's rim and beside the erased laser (so that seams there are soft too), and very much more where the laser was
-erased or terrain hides the cell, so that such pixels serve only where no other image sees the place. The lowest
-cost wins; within some centimetres of a seam images are blended by exp(-cost / feather), which does not
-depend on their order.
+Images are given a cost at each place: metres from the place to the image's optical axis, more on ground seen at an
+angle, at the image's rim, beside the erased laser and beside what terrain hides (so that seams there are soft too and
+keep away from edges), and very much more where the laser was erased or terrain hides the place, so that such pixels
+serve only where no other image sees it. The lowest cost wins; within some centimetres of a seam images are blended by
+exp(-cost / feather). The first pass (`plan`) does this without any image's colours: on nodes, and pixel by pixel only
+in blocks where more than one image counts. The second (`compose`) asks for each image that counts anywhere, once,
+and lays it down.
+
+Colours are blended as light. What differs between neighbouring images over decimetres (light that was not quite
+removed) is spread over a much wider seam, by their thumbnails: the two bands of Burt and Adelson 1983.
 """
 
 import math
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 import cv2
@@ -16,73 +21,77 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.calibration import Camera
-from .camera import normalised, outline
-from .grids import Grid, axes, grid_around, intersection, window
-from .projection import Departure, departure, look_up, pixels
-from .terrain import Terrain, hidden, resample
+from .grids import Grid, window
+from .nodes import (
+    BEST,
+    BLOCK,
+    ERASED,
+    ERASED_M,
+    OUTSIDE,
+    Ground,
+    Lie,
+    Seen,
+    Shot,
+    quality_cost,
+    quality_scale,
+    see,
+    small_at,
+    upsample,
+)
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-Indices = NDArray[np.int64]
 Pixels = NDArray[np.uint8]
+Tone = Callable[[Array32, Array32, Array32], tuple[Array32, Array32]]
+Read = Callable[[int, int], Pixels]
 
-_ERASED_M: Final = 1e3  # cost of a pixel that was painted over the laser
-_HIDDEN_M: Final = 1e4
-_RIM_PX: Final = 16  # seams at an image's rim and beside the laser are softened over so many pixels
-_RIM_FEATHERS: Final = 6
-_REACH_FEATHERS: Final = 16  # an image that costs so much more than another does not count
-_PAINT_SHRINK: Final = 4
+FEATHER_M: Final = 0.02
+_REACH_FEATHERS: Final = 8  # an image that costs so much more than another does not count
+_WIDE_FEATHERS: Final = 8  # of the seam between thumbnails
+_MOST_EVENED: Final = 1.5
+_WEIGHTS: Final = 255
+_LEVELS: Final = 65535
+_DARKEST: Final = 1e-4
 _PAINT_KNOWN: Final = 1e-3
 
 
-class View(NamedTuple):
-    """One image and where it was taken from.
+class Patch(NamedTuple):
+    """An image in a block.
 
     Attributes
     ----------
-    image : (H, W, 3) uint8; the mosaic has its channels in the same order.
-    erase : (H, W) pixels that the laser lights.
-    camera : its interior orientation.
-    R_local_camera : (3, 3) rotation from camera to local axes.
-    C_local : (3,) centre of projection, local, m.
-    number : by which the mosaic names the image.
+    row, column : of the block in the tile.
+    weight : (128, 128) uint8, of 255; None where the image is alone.
+    painted : whether pixels are needed that the laser lights.
     """
 
-    image: Pixels
-    erase: Mask
-    camera: Camera
-    R_local_camera: Array
-    C_local: Array
-    number: int
+    row: int
+    column: int
+    weight: Pixels | None
+    painted: bool
 
 
-class Canvas(NamedTuple):
-    """A tile being composed; arrays (height, width).
+class Laid(NamedTuple):
+    """An image in a tile: what it sees, where it counts, and what its light is multiplied with, less what (at nodes).
 
-    Attributes
-    ----------
-    tile : grid of the mosaic.
-    terrain : what it lies on; None for a plane, where nothing hides anything.
-    z : map z of the cells, m, NaN where there is no surface.
-    cost : lowest so far, m; inf for none.
-    weight : sum of the images' exp(-(their cost - cost) / feather).
-    colour : (height, width, 3) sum of the colours with these weights.
-    source : number of the image of the lowest cost, -1 none.
-    feather_m : cost by which a weight falls to 1/e.
-    z_min, z_max : of z, m.
+    gain and veil are None for colours as they were taken.
     """
+
+    shot: Shot
+    seen: Seen
+    patches: list[Patch]
+    gain: Array32 | None
+    veil: Array32 | None
+
+
+class Plan(NamedTuple):
+    """A tile before its colours: source (rows, columns of its blocks) int32 is -1 where nothing is seen."""
 
     tile: Grid
-    terrain: Terrain | None
-    z: Array
-    cost: Array32
-    weight: Array32
-    colour: Array32
+    place: Ground
+    laid: tuple[Laid, ...]
     source: NDArray[np.int32]
-    feather_m: float
-    z_min: float
-    z_max: float
 
 
 class Mosaic(NamedTuple):
@@ -100,129 +109,276 @@ class Mosaic(NamedTuple):
     source: NDArray[np.int32]
 
 
-def start(tile: Grid, terrain: Terrain, feather_m: float = 0.02) -> Canvas:
-    """An empty tile over terrain.
+def plan(
+    tile: Grid,
+    place: Ground,
+    shots: Sequence[tuple[Shot, Lie]],
+    tone: Tone | None = None,
+    feather_m: float = FEATHER_M,
+) -> Plan:
+    """Which image is shown where, from shots in the order of their numbers.
 
-    The terrain's grid should reach two of its cells beyond the tile, and, so that occlusion is the same in every
-    tile, as far as terrain can throw a shadow: relief times the tangent of the camera's half field of view.
+    tone(u, v, range_m) gives gain and veil (..., 3) at an image's pixels u, v and distance range_m (...): light is
+    multiplied with the one, less the other. None: colours as they were taken.
     """
-    return empty_canvas(tile, terrain, resample(terrain.elevation, terrain.grid, tile), feather_m)
+    found = [(shot, see(place, shot, lie, feather_m)) for shot, lie in shots]
+    views = [(shot, seen) for shot, seen in found if seen is not None]
+    best = _upper_bound(place, views, feather_m)
+    source = np.full(place.blocks.shape, -1, np.int32)
+    patches: list[list[Patch]] = [[] for _ in views]
+    reach = _REACH_FEATHERS * feather_m + place.nodes.cell_m
+    for (row, column), rivals in sorted(_rivals(place, views, best, reach).items()):
+        at = slice(row * BLOCK, (row + 1) * BLOCK), slice(column * BLOCK, (column + 1) * BLOCK)
+        source[at] = _share_out(place, views, rivals, (row, column), feather_m, patches)
+    tones = _tones(place, views, patches, best, tone, feather_m)
+    laid = [
+        Laid(shot, seen, parts, *both) for (shot, seen), parts, both in zip(views, patches, tones, strict=True) if parts
+    ]
+    return Plan(tile, place, tuple(laid), source)
 
 
-def empty_canvas(tile: Grid, terrain: Terrain | None, z: Array, feather_m: float) -> Canvas:
-    """A canvas on given heights z (height, width)."""
-    return Canvas(
-        tile,
-        terrain,
-        z,
-        np.full(tile.shape, np.inf, np.float32),
-        np.zeros(tile.shape, np.float32),
-        np.zeros((*tile.shape, 3), np.float32),
-        np.full(tile.shape, -1, np.int32),
-        feather_m,
-        float(np.fmin.reduce(z, axis=None)),
-        float(np.fmax.reduce(z, axis=None)),
+def _part(place: Ground, seen: Seen) -> tuple[slice, slice]:
+    """The tile's nodes that an image's arrays are of."""
+    row, column = seen.row * BLOCK // place.step, seen.column * BLOCK // place.step
+    return slice(row, row + seen.u.shape[0]), slice(column, column + seen.u.shape[1])
+
+
+def _upper_bound(place: Ground, views: Sequence[tuple[Shot, Seen]], feather_m: float) -> Array32:
+    """The most that the best image costs around each node."""
+    best = np.full(place.nodes.shape, np.inf, np.float32)
+    for _, seen in views:
+        at = _part(place, seen)
+        best[at] = np.fmin(best[at], seen.cost + quality_cost(seen.quality, feather_m))
+    return best
+
+
+def _rivals(
+    place: Ground, views: Sequence[tuple[Shot, Seen]], best: Array32, reach_m: float
+) -> dict[tuple[int, int], list[int]]:
+    """Of each block the images that may count in it."""
+    rivals: dict[tuple[int, int], list[int]] = {}
+    per_block = BLOCK // place.step
+    around = np.ones((3, 3), np.uint8)
+    for k, (shot, seen) in enumerate(views):
+        with np.errstate(invalid="ignore"):
+            counts = (seen.cost < best[_part(place, seen)] + reach_m) & _in_image(place, shot, seen)
+        near = np.asarray(cv2.dilate(counts.astype(np.uint8), around))[1:-1, 1:-1]
+        rows, columns = near.shape[0] // per_block, near.shape[1] // per_block
+        blocks = near.reshape(rows, per_block, columns, per_block).any((1, 3))
+        for row, column in np.argwhere(blocks).tolist():
+            rivals.setdefault((row + seen.row, column + seen.column), []).append(k)
+    return rivals
+
+
+def _in_image(place: Ground, shot: Shot, seen: Seen) -> Mask:
+    """Nodes in the image or next to it."""
+    camera = shot.camera
+    rim = 2 * place.nodes.cell_m * max(camera.fx, camera.fy) / seen.range_m + quality_scale(camera)
+    inside = (seen.u >= -rim) & (seen.u <= camera.width - 1 + rim)
+    return inside & (seen.v >= -rim) & (seen.v <= camera.height - 1 + rim)
+
+
+def _block_nodes(place: Ground, seen: Seen, row: int, column: int) -> tuple[slice, slice]:
+    """Of an image's arrays those nodes that a block of the tile is interpolated from."""
+    size = BLOCK // place.step
+    first = (row - seen.row) * size, (column - seen.column) * size
+    return slice(first[0], first[0] + size + 2), slice(first[1], first[1] + size + 2)
+
+
+def _share_out(
+    place: Ground,
+    views: Sequence[tuple[Shot, Seen]],
+    rivals: Sequence[int],
+    block: tuple[int, int],
+    feather_m: float,
+    patches: list[list[Patch]],
+) -> NDArray[np.int32] | int:
+    """Weights of the images in a block, added to their patches; the number of the image behind each pixel."""
+    if len(rivals) == 1 and _clean(place, views[rivals[0]][1], block):
+        patches[rivals[0]].append(Patch(*block, None, False))
+        return views[rivals[0]][0].number
+    costs = [_pixel_cost(place, *views[k], block, feather_m) for k in rivals]
+    lowest, first = _lowest(costs)
+    seen_at_all = np.isfinite(lowest)
+    weights = [cv2.exp((np.where(seen_at_all, lowest, 0) - cost) / np.float32(feather_m)) for cost in costs]
+    scale = np.float32(_WEIGHTS) / np.maximum(sum(weights), np.float32(1))
+    shares = [np.rint(weight * scale).astype(np.int16) for weight in weights]
+    rest = np.where(seen_at_all, _WEIGHTS - sum(shares), 0)
+    for place_in_line, (k, share, cost) in enumerate(zip(rivals, shares, costs, strict=True)):
+        share = share + np.where(first == place_in_line, rest, 0)
+        if share.any():
+            painted = bool(((cost >= ERASED_M) & (share > 0)).any())
+            patches[k].append(Patch(*block, share.astype(np.uint8), painted))
+    numbers = np.array([views[k][0].number for k in rivals], np.int32)
+    return np.where(seen_at_all, numbers[first], np.int32(-1))
+
+
+def _lowest(costs: Sequence[Array32]) -> tuple[Array32, NDArray[np.uint16]]:
+    """The lowest of costs, pixel by pixel, and which of them it is."""
+    lowest, first = costs[0], np.zeros(costs[0].shape, np.uint16)
+    for k, cost in enumerate(costs[1:], 1):
+        first[cost < lowest] = k
+        lowest = np.minimum(lowest, cost)
+    return lowest, first
+
+
+def _clean(place: Ground, seen: Seen, block: tuple[int, int]) -> bool:
+    at = _block_nodes(place, seen, *block)
+    return bool((seen.quality[at] == BEST).all() and np.isfinite(seen.cost[at]).all())
+
+
+def _pixel_cost(place: Ground, shot: Shot, seen: Seen, block: tuple[int, int], feather_m: float) -> Array32:
+    """Cost (128, 128) of an image's pixels in a block, inf outside of it."""
+    at = _block_nodes(place, seen, *block)
+    cost = upsample(seen.cost[at], place.step)
+    if not (seen.quality[at] == BEST).all():
+        scale = quality_scale(shot.camera)
+        u, v = (upsample((w[at] + np.float32(0.5)) / scale - np.float32(0.5), place.step) for w in (seen.u, seen.v))
+        quality = cv2.remap(shot.quality, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[OUTSIDE])
+        cost = cost + quality_cost(np.asarray(quality, np.uint8), feather_m)
+    return np.where(np.isfinite(cost), cost, np.float32(np.inf))
+
+
+def _tones(
+    place: Ground,
+    views: Sequence[tuple[Shot, Seen]],
+    patches: Sequence[Sequence[Patch]],
+    best: Array32,
+    tone: Tone | None,
+    feather_m: float,
+) -> list[tuple[Array32 | None, Array32 | None]]:
+    """Gain and veil at the nodes of each image that counts, evened out with its neighbours'."""
+    if tone is None:
+        return [(None, None)] * len(views)
+    even = _thumbnails_blended(place, views, best, feather_m)
+    result: list[tuple[Array32 | None, Array32 | None]] = []
+    for (shot, seen), parts in zip(views, patches, strict=True):
+        if not parts:
+            result.append((None, None))
+            continue
+        gain, veil = tone(seen.u, seen.v, seen.range_m)
+        if shot.thumbnail is not None:
+            own = np.maximum(small_at(shot.thumbnail, shot.camera, seen.u, seen.v), _DARKEST)
+            ratio = np.clip(even[_part(place, seen)] / own, 1 / _MOST_EVENED, _MOST_EVENED).astype(np.float32)
+            gain, veil = gain * ratio, veil * ratio
+        result.append((np.nan_to_num(gain), np.nan_to_num(veil)))
+    return result
+
+
+def _thumbnails_blended(place: Ground, views: Sequence[tuple[Shot, Seen]], best: Array32, feather_m: float) -> Array32:
+    """Colours (rows, columns, 3) of the thumbnails at the nodes, blended over wide seams."""
+    total, weights = np.zeros((*place.nodes.shape, 3), np.float32), np.zeros(place.nodes.shape, np.float32)
+    for shot, seen in views:
+        if shot.thumbnail is None:
+            continue
+        at = _part(place, seen)
+        with np.errstate(invalid="ignore", over="ignore"):
+            weight = np.exp(-np.maximum(seen.cost - best[at], 0) / (_WIDE_FEATHERS * feather_m)) * _from_rim(shot, seen)
+        weight = np.nan_to_num(weight).astype(np.float32) + np.float32(1e-12)
+        total[at] += small_at(shot.thumbnail, shot.camera, seen.u, seen.v) * weight[..., None]
+        weights[at] += weight
+    return (total / np.maximum(weights, 1e-12)[..., None]).astype(np.float32)
+
+
+def _from_rim(shot: Shot, seen: Seen) -> Array32:
+    """0 at the image's rim and outside, 1 a tenth of its size inside."""
+    camera = shot.camera
+    across = np.minimum(seen.u, camera.width - 1 - seen.u) / (0.1 * camera.width)
+    down = np.minimum(seen.v, camera.height - 1 - seen.v) / (0.1 * camera.height)
+    return np.clip(np.minimum(across, down), 0, 1).astype(np.float32)
+
+
+def reduction(camera: Camera, range_m: float, cell_m: float) -> int:
+    """How many times smaller, a power of two, an image may be read for a mosaic's cell at such a distance."""
+    ratio = cell_m * math.sqrt(camera.fx * camera.fy) / range_m
+    return 2 ** max(0, math.floor(math.log2(max(ratio, 1e-6)) + 0.25))
+
+
+def compose(plans: Sequence[Plan], read: Read, reductions: dict[int, int], gamma: float = 1.0) -> list[Mosaic]:
+    """The tiles of several plans, each image read once.
+
+    Parameters
+    ----------
+    plans : of the same images.
+    read : read(number, times) is the image of a number, (rows, columns, 3) uint8, so many times smaller.
+    reductions : how many times, by number.
+    gamma : level = light ** (1 / gamma).
+    """
+    light = ((np.arange(256) / 255) ** gamma).astype(np.float32)
+    sums = [np.zeros((*p.place.blocks.shape, 3), np.float32) for p in plans]
+    for number, parts in _by_number(plans):
+        times = reductions[number]
+        image = read(number, times)
+        painted = None
+        for k, laid in parts:
+            for patch in laid.patches:
+                if patch.painted and painted is None:
+                    painted = paint_over(image, laid.shot.quality == ERASED)
+                source = painted if patch.painted and painted is not None else image
+                _lay(sums[k], plans[k].place, laid, patch, source, times, light)
+    return [_finish(p, total, gamma) for p, total in zip(plans, sums, strict=True)]
+
+
+def _by_number(plans: Sequence[Plan]) -> Iterator[tuple[int, list[tuple[int, Laid]]]]:
+    """Of each image its parts in the plans."""
+    found: dict[int, list[tuple[int, Laid]]] = {}
+    for k, made in enumerate(plans):
+        for laid in made.laid:
+            found.setdefault(laid.shot.number, []).append((k, laid))
+    yield from sorted(found.items())
+
+
+def _lay(total: Array32, place: Ground, laid: Laid, patch: Patch, image: Pixels, times: int, light: Array32) -> None:
+    """Adds an image's colours to a block, as light."""
+    nodes = _block_nodes(place, laid.seen, patch.row, patch.column)
+    u, v = (
+        upsample((w[nodes] + np.float32(0.5)) / times - np.float32(0.5), place.step) for w in (laid.seen.u, laid.seen.v)
     )
+    colour = cv2.LUT(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), light)
+    if laid.gain is not None and laid.veil is not None:
+        colour = cv2.subtract(
+            cv2.multiply(colour, upsample(laid.gain[nodes], place.step)), upsample(laid.veil[nodes], place.step)
+        )
+    at = total[patch.row * BLOCK : (patch.row + 1) * BLOCK, patch.column * BLOCK : (patch.column + 1) * BLOCK]
+    if patch.weight is None:
+        at[:] = colour
+    else:
+        share = np.multiply(patch.weight, np.float32(1 / _WEIGHTS), dtype=np.float32)
+        at += cv2.multiply(colour, cv2.merge([share] * 3))
 
 
-def add_view(canvas: Canvas, view: View) -> Canvas:
-    """The canvas with one image more; its arrays are updated in place."""
-    assert canvas.terrain is not None
-    local = canvas.terrain.local
-    A = view.R_local_camera.T @ local.matrix
-    return composite(canvas, view, A, view.R_local_camera.T @ (local.offset - view.C_local))
+def _finish(made: Plan, total: Array32, gamma: float) -> Mosaic:
+    """Light to levels."""
+    at = window(made.place.blocks, made.tile)
+    levels = np.rint(255 * (np.arange(_LEVELS + 1) / _LEVELS) ** (1 / gamma)).astype(np.uint8)
+    light, source = total[at], made.source[at]
+    rgb = np.empty((3, *source.shape), np.uint8)
+    for row in range(0, len(light), BLOCK):  # what is worked on stays in the processor's cache
+        rows = slice(row, row + BLOCK)
+        rgb[:, rows] = [
+            levels.take(np.asarray(band, np.uint16), mode="wrap") for band in cv2.split(_as_16_bits(light[rows]))
+        ]
+    return Mosaic(rgb, source >= 0, np.ascontiguousarray(source))
 
 
-def composite(canvas: Canvas, view: View, A: Array, b: Array) -> Canvas:
-    """Adds an image for which X_camera = A (3, 3) @ (x, y, z of the canvas) + b (3,)."""
-    part = _footprint(canvas, view.camera, A, b)
-    if part is None:
-        return canvas
-    rows, columns = window(canvas.tile, part)
-    table, worth = departure(view.camera), canvas.cost[rows, columns] + _REACH_FEATHERS * canvas.feather_m
-    cell, X, Y, Z = _candidates(table, part, canvas.z[rows, columns], worth, A, b)
-    u, v = pixels(table, X, Y, Z)
-    cost = np.hypot(X, Y).astype(np.float32) + look_up(_pixel_costs(view.erase, canvas.feather_m), u, v)
-    if canvas.terrain is not None:
-        cost += _HIDDEN_M * hidden(canvas.terrain, part, -np.linalg.inv(A) @ b).ravel()[cell]
-    height, width = view.erase.shape
-    counts = np.flatnonzero((u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1) & (cost < worth.ravel()[cell]))
-    scale = canvas.tile.cell_m * math.sqrt(view.camera.fx * view.camera.fy) / Z[counts]
-    colour = _sample(paint_over(view.image, view.erase), u[counts], v[counts], scale)
-    row, column = np.divmod(cell[counts], part.width)
-    at = (row + rows.start) * canvas.tile.width + column + columns.start
-    _blend(canvas, at, cost[counts], colour, view.number)
-    return canvas
-
-
-def _candidates(
-    table: Departure, part: Grid, z: Array, worth: Array32, A: Array, b: Array
-) -> tuple[Indices, Array, Array, Array]:
-    """Cells (K,), flat, in the image and no farther from its axis than worth, and their X, Y, Z in the camera frame.
-
-    What is left out could not count: the distance to the axis is the least that a pixel costs.
-    """
-    x, y = axes(part)
-    X, Y, Z = (A[k, 2] * z + (A[k, 0] * x + b[k]) + A[k, 1] * y[:, None] for k in range(3))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        across, down = X / Z, Y / Z
-    (left, top), (right, bottom) = table.bounds
-    near = (Z > 0) & (across >= left) & (across <= right) & (down >= top) & (down <= bottom) & (np.hypot(X, Y) < worth)
-    cell = np.flatnonzero(near)
-    return cell, X.ravel()[cell], Y.ravel()[cell], Z.ravel()[cell]
-
-
-def finish(canvas: Canvas) -> Mosaic:
-    """The tile's colours, its mask and the image behind each cell."""
-    mask = canvas.weight > 0
-    mean = canvas.colour / np.maximum(canvas.weight, 1e-30)[..., None]
-    rgb = np.clip(np.rint(mean), 0, 255).astype(np.uint8)
-    return Mosaic(np.ascontiguousarray(np.moveaxis(rgb, 2, 0)), mask, canvas.source)
-
-
-def _blend(canvas: Canvas, at: Indices, cost: Array32, colour: Pixels, number: int) -> None:
-    """Adds colours (K, 3) to flat cells; sums so far are of weights relative to the lowest cost, and shrink with it."""
-    lowest, weight, source = canvas.cost.reshape(-1), canvas.weight.reshape(-1), canvas.source.reshape(-1)
-    sums, old = canvas.colour.reshape(-1, 3), lowest[at]
-    best = np.minimum(old, cost)
-    keep, add = np.exp((best - old) / canvas.feather_m), np.exp((best - cost) / canvas.feather_m)
-    weight[at] = weight[at] * keep + add
-    sums[at] = sums[at] * keep[:, None] + colour * add[:, None]
-    source[at] = np.where(cost < old, np.int32(number), source[at])
-    lowest[at] = best
-
-
-def _footprint(canvas: Canvas, camera: Camera, A: Array, b: Array) -> Grid | None:
-    """The part of the tile with every cell that the image can see, from its outline on lowest and highest ground."""
-    slopes, inverse = normalised(camera, outline(camera, 9)), np.linalg.inv(A)
-    C, direction = -inverse @ b, np.column_stack([slopes, np.ones(len(slopes))]) @ inverse.T
-    if (direction[:, 2] > -0.1).any() or not C[2] > canvas.z_max:
-        return canvas.tile  # the horizon is in the picture, or the ground is beside the camera
-    ground = [C + direction * ((z - C[2]) / direction[:, 2])[:, None] for z in (canvas.z_min, canvas.z_max)]
-    x, y = np.concatenate(ground)[:, :2].T
-    # 5 % for what bulges between the outline's points
-    margin = 2 * canvas.tile.cell_m + 0.05 * max(np.ptp(x), np.ptp(y))
-    bounds = x.min() - margin, y.min() - margin, x.max() + margin, y.max() + margin
-    return intersection(canvas.tile, grid_around(bounds, canvas.tile.cell_m))
-
-
-def _pixel_costs(erase: Mask, feather_m: float) -> Array32:
-    """Cost in metres of each pixel (H, W) for where it is in its image."""
-    usable = np.pad(~erase, 1).astype(np.uint8)
-    depth = cv2.distanceTransform(usable, cv2.DIST_L2, 3)[1:-1, 1:-1]
-    soft = _RIM_FEATHERS * feather_m * (1 - np.minimum(depth, _RIM_PX) / _RIM_PX)
-    return (soft + _ERASED_M * erase).astype(np.float32)
+def _as_16_bits(light: NDArray) -> NDArray[np.uint16]:
+    full_scale = np.full(4, _LEVELS, float)
+    return np.asarray(cv2.multiply(light, full_scale, dtype=cv2.CV_16U), np.uint16)
 
 
 def paint_over(image: Pixels, erase: Mask) -> Pixels:
-    """The image (H, W, 3) with erased pixels filled from around them, coarse to fine (push-pull, Gortler 1996)."""
+    """The image (H, W, 3) with erased pixels filled from around them, coarse to fine (push-pull, Gortler 1996).
+
+    erase (h, w) may be of a smaller image.
+    """
     if not erase.any():
         return image
-    size = max(1, image.shape[1] // _PAINT_SHRINK), max(1, image.shape[0] // _PAINT_SHRINK)
-    kept = np.where(erase[..., None], np.uint8(0), image)
-    weight = cv2.resize((~erase).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    size = erase.shape[1], erase.shape[0]
+    full = np.asarray(cv2.resize((~erase).astype(np.uint8), image.shape[1::-1], interpolation=cv2.INTER_NEAREST))
+    kept = np.asarray(cv2.copyTo(image, full, np.zeros_like(image)))
+    shrunk = cv2.resize(full * np.uint8(_WEIGHTS), size, interpolation=cv2.INTER_AREA).astype(np.float32) / _WEIGHTS
     levels: list[tuple[NDArray, NDArray]] = [
-        (cv2.resize(kept, size, interpolation=cv2.INTER_AREA).astype(np.float32), weight)
+        (cv2.resize(kept, size, interpolation=cv2.INTER_AREA).astype(np.float32), shrunk)
     ]
     while levels[-1][1].min() < _PAINT_KNOWN and min(levels[-1][1].shape) > 1:
         colour, weight = levels[-1]
@@ -231,16 +387,4 @@ def paint_over(image: Pixels, erase: Mask) -> Pixels:
     for colour, weight in reversed(levels[:-1]):
         filled = cv2.pyrUp(filled, dstsize=weight.shape[::-1]) * (1 - weight)[..., None] + colour
     smooth = cv2.resize(np.clip(np.rint(filled), 0, 255).astype(np.uint8), image.shape[1::-1])
-    return np.where(erase[..., None], smooth, image)
-
-
-def _sample(image: Pixels, u: Array32, v: Array32, scale: Array) -> Pixels:
-    """Colours (K, 3) at pixels u, v; where a cell takes in many pixels (scale), from a smoothed, halved image."""
-    level = np.clip(np.rint(np.log2(scale)), 0, 8).astype(np.int8)
-    colour, halved = np.zeros((len(u), 3), np.uint8), np.asarray(image)
-    for k in range(int(level.max(initial=0)) + 1):
-        here = np.flatnonzero(level == k)
-        if len(here):
-            colour[here] = look_up(halved, u[here] / np.float32(2**k), v[here] / np.float32(2**k))
-        halved = np.asarray(cv2.pyrDown(halved))
-    return colour
+    return np.asarray(cv2.copyTo(image, full, smooth), np.uint8)

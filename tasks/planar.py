@@ -12,8 +12,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
-from .grids import Grid
-from .mosaic import Canvas, View, composite, empty_canvas
+from .nodes import Lie
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.integer]
@@ -128,20 +127,15 @@ def _design(matches: Matches, count: int) -> sparse.csr_matrix:
     return sparse.csr_matrix((values, (rows, columns)), shape=(2 * size, 4 * count))
 
 
-def start(tile: Grid, feather_m: float = 0.02) -> Canvas:
-    """An empty tile of the plane; `mosaic.finish` ends it."""
-    return empty_canvas(tile, None, np.zeros(tile.shape), feather_m)
+def lie(R_local_camera: Array, map_from_slopes: Array) -> Lie:
+    """How an image lies to the plane z = 0 by its similarity (2, 3) from levelled slopes to the map.
 
-
-def add_view(canvas: Canvas, view: View, map_from_slopes: Array) -> Canvas:
-    """The canvas with one image more, laid down by its similarity (2, 3) from levelled slopes to the map.
-
-    The plane lies as far below the camera as the similarity's scale says; of the view's pose only the attitude is
+    The plane lies as far below the camera as the similarity's scale says; of the image's pose only the attitude is
     used.
     """
     linear = map_from_slopes[:, :2]
     altitude = float(np.sqrt(np.linalg.det(linear)))
     level = np.zeros((3, 3))
     level[:2, :2], level[2, 2] = altitude * np.linalg.inv(linear), 1.0
-    A = view.R_local_camera.T @ level
-    return composite(canvas, view, A, -A @ np.array([*map_from_slopes[:, 2], altitude]))
+    A = R_local_camera.T @ level
+    return Lie(A, -A @ np.array([*map_from_slopes[:, 2], altitude]))

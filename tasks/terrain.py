@@ -1,7 +1,8 @@
 """The ground under a mosaic: its height at each cell and what it hides from a camera."""
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +10,9 @@ from .frames import LocalAffine
 from .grids import Grid, axes, grid_around, intersection, pad, window
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+
+_FLOAT32_M: Final = 1e-3  # more than heights lose as float32
+_RINGS: Final = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)  # cells; between two the nearer distance is taken
 
 
 class Terrain(NamedTuple):
@@ -76,21 +79,43 @@ def _bilinear(padded: Array, row: NDArray[np.int64], y: Array, column: NDArray[n
     return lines[:, column] * (1 - x) + lines[:, column + 1] * x
 
 
-def hidden(terrain: Terrain, cells: Grid, C_map: Array) -> Mask:
-    """Cells (height, width) that terrain hides from a camera at C_map (3,), map coordinates.
+def horizon(terrain: Terrain) -> Array:
+    """What the ground around each cell of the terrain may rise to: tangent of an angle, -inf for nothing.
+
+    Never less than in any one direction: a camera that stands higher above a cell sees it, and no ray has to be
+    followed to know.
+    """
+    z = np.where(np.isfinite(terrain.elevation), terrain.elevation, -np.inf)
+    highest, steepest, nearer = (z + _FLOAT32_M).astype(np.float32), np.full(z.shape, -np.inf), 0
+    for reach in [*_RINGS, max(z.shape)]:
+        if reach <= nearer:
+            continue
+        window = np.ones((2 * (reach - nearer) + 1,) * 2, np.uint8)
+        within = cv2.dilate(highest, window, borderType=cv2.BORDER_CONSTANT, borderValue=-np.inf)
+        highest = within if reach in _RINGS else np.full(z.shape, highest.max(initial=-np.inf))
+        with np.errstate(invalid="ignore"):
+            rise = (highest - z) / terrain.grid.cell_m - 1
+        steepest = np.fmax(steepest, rise / (nearer + 1))
+        nearer = reach
+    return steepest
+
+
+def hidden(terrain: Terrain, steepest: Array, cells: Grid, C_map: Array) -> Array:
+    """Share 0..1 of cells (height, width) that terrain hides from a camera at C_map (3,), map coordinates.
 
     Marches on the bathymetry's grid from each of its cells towards the camera, a cell at a time, until the ray is
     above all ground. Ground hides when it rises above the ray by more than a cell's size, so that a rough slope
-    does not hide itself.
+    does not hide itself. Only cells below their `horizon`, steepest, can be hidden.
     """
     grid = intersection(terrain.grid, pad(grid_around(cells.bounds, terrain.grid.cell_m), 1))
     if grid is None:
-        return np.zeros(cells.shape, bool)
+        return np.zeros(cells.shape)
     rows, columns = window(terrain.grid, grid)
-    ground = terrain.elevation[rows, columns]
-    found = np.where(np.isfinite(ground), 0.0, np.nan)
-    rays = _rays(grid, ground, C_map, rows.start, columns.start)
-    top = np.nanmax(terrain.elevation, initial=-np.inf) if np.isfinite(ground).any() else -np.inf
+    rays = _rays(terrain, steepest, grid, C_map)
+    if not len(rays.cell):
+        return np.zeros(cells.shape)
+    found = np.where(np.isfinite(terrain.elevation[rows, columns]), 0.0, np.nan)
+    top = float(np.nanmax(terrain.elevation))
     step = 0
     while len(rays.cell):
         step += 1
@@ -103,25 +128,42 @@ def hidden(terrain: Terrain, cells: Grid, C_map: Array) -> Mask:
         blocked = terrain.elevation[row[going], column[going]] > height[going]
         found.reshape(-1)[rays.cell[going[blocked]]] = 1.0
         rays = _Rays._make(values[going[~blocked]] for values in rays)
-    if not (found == 1).any():
-        return np.zeros(cells.shape, bool)
-    return resample(found, grid, cells) > 0.5
+    return np.nan_to_num(resample(found, grid, cells)) if (found == 1).any() else np.zeros(cells.shape)
 
 
-def _rays(grid: Grid, ground: Array, C_map: Array, row_start: int, column_start: int) -> _Rays:
-    cell = np.flatnonzero(np.isfinite(ground) & (ground < C_map[2]))
-    row, column = np.divmod(cell, grid.width)
+def _rays(terrain: Terrain, steepest: Array, grid: Grid, C_map: Array) -> _Rays:
+    """The rays from those cells of a part of the terrain's grid that may be hidden."""
+    rows, columns = window(terrain.grid, grid)
     x, y = axes(grid)
-    east, north = C_map[0] - x[column], C_map[1] - y[row]
-    away = np.maximum(np.hypot(east, north), 1e-9)
-    height = ground.ravel()[cell]
+    ground, east, north = terrain.elevation[rows, columns], C_map[0] - x, (C_map[1] - y)[:, None]
+    away = np.maximum(np.sqrt(east**2 + north**2), 1e-9)
+    above = C_map[2] - ground
+    with np.errstate(invalid="ignore"):
+        cell = np.flatnonzero((above > 0) & (above < steepest[rows, columns] * away))
+    row, column = np.divmod(cell, grid.width)
+    height, away = ground.ravel()[cell], away.ravel()[cell]
     return _Rays(
         cell,
-        row + row_start,
-        column + column_start,
-        -north / away,
-        east / away,
+        row + rows.start,
+        column + columns.start,
+        -north.ravel()[row] / away,
+        east[column] / away,
         height + grid.cell_m,
         grid.cell_m * (C_map[2] - height) / away,
         away / grid.cell_m,
     )
+
+
+def slopes(terrain: Terrain, smooth_cells: int = 5) -> tuple[Array, Array]:
+    """Slopes dz/dx and dz/dy of the terrain's cells, mean over so many cells; 0 where there is no ground."""
+    known = np.isfinite(terrain.elevation)
+    down, right = np.gradient(np.where(known, terrain.elevation, np.nan), terrain.grid.cell_m)
+    return _mean(right, smooth_cells), _mean(-down, smooth_cells)
+
+
+def _mean(values: Array, cells: int) -> Array:
+    known = np.isfinite(values).astype(float)
+    total, weight = (
+        cv2.blur(layer, (cells, cells), borderType=cv2.BORDER_CONSTANT) for layer in (np.nan_to_num(values), known)
+    )
+    return np.where(weight > 0.5 / cells**2, total / np.maximum(weight, 1e-9), 0.0)

@@ -59,8 +59,8 @@ def _rejected(job: Job, image: ImageTask, error: Exception) -> dict:
     return {"status": f"rejected: {error}", "soundings": 0, "features": 0}
 
 
-def read_verified(job: Job, path: str, sha256: str) -> np.ndarray:
-    """An image (H, W, 3) BGR, if it still is the one that was opened.
+def read_verified(job: Job, path: str, sha256: str, reduce: int = 1) -> np.ndarray:
+    """An image (H, W, 3) BGR, so many times smaller, if it still is the one that was opened.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def read_verified(job: Job, path: str, sha256: str) -> np.ndarray:
     OSError
         It cannot be read now, or it changed since.
     """
-    decoded = read_image(job.mission_url, path, job.calibration.camera)
+    decoded = read_image(job.mission_url, path, job.calibration.camera, reduce)
     if decoded.sha256 != sha256:
         raise OSError(f"{path} changed while the mission was being processed; run again")
     return decoded.bgr

@@ -5,7 +5,7 @@ import inspect
 import logging
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib.metadata import version
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -101,7 +101,7 @@ def once(
     inputs: Sequence[str],
     parameters: Any,
     make: Callable[[], Made],
-    compress: bool = False,
+    compress: bool | Collection[str] = False,
 ) -> Done:
     """The stored result of a step, made now if the store does not have it."""
     key = digest(step, code, inputs, parameters)
@@ -117,15 +117,15 @@ def once(
     return Done(step, key, True, seconds, info)
 
 
-def load(job: Job, step: str, key: str) -> Entry:
-    """A result that an earlier step stored.
+def load(job: Job, step: str, key: str, names: Collection[str] | None = None) -> Entry:
+    """A result that an earlier step stored, or those of its arrays that are named.
 
     Raises
     ------
     LostEntry
         If it is gone or damaged; a rerun makes it again.
     """
-    entry = job.store.get(step, key)
+    entry = job.store.get(step, key, names)
     if entry is None:
         job.store.remove(step, key)
         raise LostEntry(f"{job.store.path(step, key)} is gone or damaged; run again to make it anew")

@@ -8,7 +8,7 @@ from dask.delayed import delayed
 from ..tasks import camera as cameras
 from ..tasks import grids, pairs
 from ..tasks.grids import Grid
-from . import maps
+from . import maps, mosaics
 from .job import Done
 from .maps import Image, MapJob, Pair, Tile
 from .results import Mapped, Posed, Tiles
@@ -27,10 +27,10 @@ class NothingToMap(RuntimeError):
 def map_tiles(state: Session, posed: Posed) -> Mapped:
     """Tiles: cells, surface, mosaics."""
     job, p = state.job, state.job.parameters
-    images = _images(state, posed)
+    ranges = np.array([range_of(posed.extracted.get(k), state.plan.range_m[k]) for k in range(len(state.plan.range_m))])
+    images = _images(state, posed, ranges)
     if not images:
         raise NothingToMap("no image has a pose: there is nothing to map")
-    ranges = np.array([range_of(posed.extracted.get(k), state.plan.range_m[k]) for k in range(len(state.plan.range_m))])
     typical = float(np.median(ranges[[image.row for image in images]]))
     gsd = cameras.ground_sample_distance(job.calibration.camera, typical)
     cell = grids.bathymetry_cell_m(gsd) if p.grid.cell_m == "auto" else float(p.grid.cell_m)
@@ -40,17 +40,23 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     outlines = _outlines(state, posed.solution, ranges)
     surface_tiles = _surface(state, m, posed, images, outlines, cell)
     textured = [image for image in images if image.texture]
-    light = _lighting(state, textured)
-    by_row = {image.row: float(ranges[image.row]) for image in textured}
-    ortho, planar = _mosaics(state, m, textured, outlines, surface_tiles, mosaic_cell, light, posed, by_row)
-    return Mapped(m, cell, mosaic_cell, surface_tiles, ortho, planar, outlines)
+    light = _lighting(state, m, textured)
+    mosaic = _mosaics(state, m, textured or images, outlines, surface_tiles, mosaic_cell, light, posed)
+    return Mapped(m, cell, mosaic_cell, surface_tiles, mosaic, outlines)
 
 
-def _images(state: Session, posed: Posed) -> list[Image]:
-    """Images with a pose whose extraction went well."""
+def _images(state: Session, posed: Posed, ranges: np.ndarray) -> list[Image]:
+    """Images with a pose whose extraction went well; ranges (n,) of all images."""
     known = posed.solution.poses.known
     return [
-        Image(image.row, image.path, image.sha256, posed.extracted[image.row].key, image.role != "laser")
+        Image(
+            row=image.row,
+            path=image.path,
+            sha256=image.sha256,
+            key=posed.extracted[image.row].key,
+            texture=image.role != "laser",
+            range_m=float(ranges[image.row]),
+        )
         for image in state.plan.images
         if known[image.row] and not posed.extracted[image.row].info["status"]
     ]
@@ -139,14 +145,14 @@ def _surface(
     return Tiles(grid, tuple(zip(tiles, surfaces, strict=True)))
 
 
-def _lighting(state: Session, images: Sequence[Image]) -> Done | None:
+def _lighting(state: Session, m: MapJob, images: Sequence[Image]) -> Done | None:
     if state.job.parameters.mosaic.colour == "none" or not images:
         return None
-    state.ledger.begin(maps.LIGHTING)
+    state.ledger.begin(mosaics.LIGHTING)
     every = max(1, len(images) // _LIGHTING_IMAGES)
-    task = delayed(maps.lighting)(state.job, list(images[::every]), dask_key_name="lighting")
-    (light,) = compute(state, maps.LIGHTING, [task])
-    state.ledger.end(maps.LIGHTING, [light])
+    task = delayed(mosaics.lighting)(m, list(images[::every]), dask_key_name="lighting")
+    (light,) = compute(state, mosaics.LIGHTING, [task])
+    state.ledger.end(mosaics.LIGHTING, [light])
     return light
 
 
@@ -159,35 +165,26 @@ def _mosaics(
     cell: float,
     light: Done | None,
     posed: Posed,
-    ranges: dict[int, float],
-) -> tuple[Tiles, Tiles]:
-    """Orthomosaic and planar mosaic on one grid."""
-    shown = images or _images(state, posed)
-    grid = grids.grid_around(_bounds(outlines, shown), cell)
-    steps = (maps.ORTHOMOSAIC, maps.ALIGN, maps.PLANAR)
-    for step in steps:
+) -> Tiles:
+    """Orthomosaic and planar mosaic on one grid; of images without texture only the grid."""
+    grid = grids.grid_around(_bounds(outlines, images), cell)
+    shown = [image for image in images if image.texture]
+    for step in (mosaics.ALIGN, mosaics.MOSAIC):
         state.ledger.begin(step)
-    align_task = delayed(maps.align_planar)(
-        m, list(images), _of_images(_linked(posed), images), ranges, dask_key_name="planar-align"
-    )
-    (aligned,) = compute(state, maps.ALIGN, [align_task])
+    linked = _of_images(_linked(posed), shown)
+    (aligned,) = compute(state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name="align")])
     tiles = list(grids.tiles(grid, state.job.parameters.mosaic.tile_cells))
-    margin = _margin(outlines, images)
-    ortho_tasks, planar_tasks = [], []
+    margin = _margin(outlines, shown)
+    tasks = []
     for k, tile in enumerate(tiles):
-        described = Tile(tile, _touching(outlines, images, tile, margin))
+        described = Tile(tile, _touching(outlines, shown, tile, margin))
         around = maps.ground_around(tile, ground.grid.cell_m, m.max_interpolation_m)
         near = [(t, done) for t, done in ground.tiles if grids.intersection(around, t)]
-        ortho_tasks.append(delayed(maps.orthomosaic_tile)(m, described, near, light, dask_key_name=f"orthomosaic-{k}"))
-        planar_tasks.append(delayed(maps.planar_tile)(m, described, aligned, light, dask_key_name=f"planar-{k}"))
-    done = compute(state, "mosaics", [*ortho_tasks, *planar_tasks])
-    ortho, planar = done[: len(tiles)], done[len(tiles) :]
-    for step, results in zip(steps, (ortho, [aligned], planar), strict=True):
+        tasks.append(delayed(mosaics.mosaic_tile)(m, described, near, aligned, light, dask_key_name=f"mosaic-{k}"))
+    done: list[Done] = compute(state, mosaics.MOSAIC, tasks)
+    for step, results in ((mosaics.ALIGN, [aligned]), (mosaics.MOSAIC, done)):
         state.ledger.end(step, results)
-    return (
-        Tiles(grid, tuple(zip(tiles, ortho, strict=True))),
-        Tiles(grid, tuple(zip(tiles, planar, strict=True))),
-    )
+    return Tiles(grid, tuple(zip(tiles, done, strict=True)))
 
 
 def range_of(done: Done | None, fallback: float) -> float:

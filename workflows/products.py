@@ -21,7 +21,7 @@ from ..schemas.products import MeshQuality, Quality
 from ..schemas.provenance import InputFile, Provenance
 from ..tasks import mesh, rotations
 from ..tasks.grids import Bounds, Grid
-from . import extract, maps, quality, report, report_figures
+from . import extract, maps, mosaics, quality, report, report_figures
 from .job import code_version, load
 from .results import Results, span, vertical_reference
 from .solve import Solution
@@ -47,7 +47,7 @@ _NAMED_BY = ("image", "role", "time", "status", "sha256")
 def write(results: Results) -> tuple[Path, bool, Quality]:
     """Write the next version, unless the newest was made from the same: its folder, whether new, its figures."""
     job, mapped = results.job, results.mapped
-    keys = [done.key for _, done in (*mapped.surface.tiles, *mapped.orthomosaic.tiles, *mapped.planar.tiles)]
+    keys = [done.key for _, done in (*mapped.surface.tiles, *mapped.mosaic.tiles)]
     keys += [done.key for done in results.posed.extracted.values()] + [results.posed.adjusted.key]
     inputs = sorted(f"{name}:{sha}" for name, sha in results.opened.input_digests.items())
     frames = results.opened.frames
@@ -177,19 +177,17 @@ def _write_bathymetry(results: Results, folder: Path, crs_wkt: str) -> None:
 
 def _write_mosaics(results: Results, folder: Path, crs_wkt: str) -> None:
     tags = {"MISSION": results.opened.mission.id}
-    ortho, planar, job = results.mapped.orthomosaic, results.mapped.planar, results.job
+    mosaic, job = results.mapped.mosaic, results.job
     with (
-        _writer(folder, "mosaic.tif", ortho.grid, crs_wkt, tags) as colours,
-        _writer(folder, "mosaic-source.tif", ortho.grid, crs_wkt, tags) as sources,
+        _writer(folder, "mosaic.tif", mosaic.grid, crs_wkt, tags) as colours,
+        _writer(folder, "mosaic-source.tif", mosaic.grid, crs_wkt, tags) as sources,
+        _writer(folder, "mosaic-planar.tif", mosaic.grid, crs_wkt, tags) as planar,
     ):
-        for tile, done in ortho.tiles:
-            arrays, place = load(job, maps.ORTHOMOSAIC, done.key).arrays, _inner(ortho.grid, tile)
+        for tile, done in mosaic.tiles:
+            arrays, place = load(job, mosaics.MOSAIC, done.key).arrays, _inner(mosaic.grid, tile)
             colours.write(*place, arrays["rgb"], arrays["mask"])
             sources.write(*place, arrays["source"])
-    with _writer(folder, "mosaic-planar.tif", planar.grid, crs_wkt, tags) as colours:
-        for tile, done in planar.tiles:
-            arrays = load(job, maps.PLANAR, done.key).arrays
-            colours.write(*_inner(planar.grid, tile), arrays["rgb"], arrays["mask"])
+            planar.write(*place, arrays["planar_rgb"], arrays["planar_mask"])
 
 
 def _write_soundings(results: Results, folder: Path, crs_wkt: str) -> int:

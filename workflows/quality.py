@@ -146,7 +146,7 @@ def _bathymetry_quality(folder: Path, cell_m: float) -> BathymetryQuality:
 
 def _mosaic_quality(results: Results) -> MosaicQuality:
     cell = results.mapped.mosaic_cell_m
-    pixels = sum(done.info["pixels"] for _, done in results.mapped.orthomosaic.tiles)
+    pixels = sum(done.info["pixels"] for _, done in results.mapped.mosaic.tiles)
     surface = sum(done.info["cells"] for _, done in results.mapped.surface.tiles) * results.mapped.cell_m**2
     area = pixels * cell**2
     return MosaicQuality(cell_m=cell, area_m2=area, coverage_share=min(1.0, area / surface) if surface else None)

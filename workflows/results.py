@@ -39,8 +39,7 @@ class Mapped(NamedTuple):
     cell_m: float
     mosaic_cell_m: float
     surface: Tiles
-    orthomosaic: Tiles
-    planar: Tiles
+    mosaic: Tiles
     outlines: np.ndarray
 
 

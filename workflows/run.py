@@ -16,7 +16,7 @@ from ..catalog.store import Store
 from ..schemas.parameters import Parameters
 from ..schemas.products import Quality
 from ..schemas.provenance import Step
-from . import extract, mapping, maps, match, plan, products, solve
+from . import extract, mapping, maps, match, mosaics, plan, products, solve
 from .executor import open_executor
 from .job import Done, Job, load, log
 from .plan import Plan
@@ -81,6 +81,7 @@ _VERSIONS = {
     match.STEP: match.VERSION,
     solve.STEP: solve.VERSION,
     **maps.VERSIONS,
+    **mosaics.VERSIONS,
 }
 
 

@@ -54,6 +54,20 @@ def test_sixteen_bits_and_grey(smooth: np.ndarray) -> None:
     np.testing.assert_array_equal(decode(encoded(".tif", smooth), CAMERA), smooth)
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+@pytest.mark.parametrize("reduce", [2, 4, 8, 16])
+def test_a_reduced_image_has_the_means_of_its_pixels_in_their_places(smooth, suffix, reduce) -> None:
+    smooth = cv2.GaussianBlur(smooth, (0, 0), 4)
+    content = encoded(suffix, smooth)
+    reduced = decode(content, CAMERA, reduce)
+    assert reduced.shape == (-(-64 // reduce), 96 // reduce, 3)
+    means = cv2.resize(decode(content, CAMERA), reduced.shape[1::-1], interpolation=cv2.INTER_AREA).astype(float)
+    assert np.abs(reduced - means).mean() < 1.0
+    assert np.abs(reduced - means[:, ::-1]).mean() > 1.5
+    with pytest.raises(UnreadableImage, match="size"):
+        decode(content, CAMERA.model_copy(update={"width": 160}), reduce)
+
+
 def test_exif_rotation_is_not_applied(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6

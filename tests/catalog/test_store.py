@@ -8,7 +8,7 @@ ARRAYS = {"points": np.arange(12.0).reshape(4, 3), "arm": np.array([0, 1, 1, 0],
 
 def test_results_come_back(tmp_path):
     for store in (Store(str(tmp_path)), Store("memory://steps")):
-        for compress in (False, True):
+        for compress in (False, True, ["arm"]):
             store.put("extract", "ab12", ARRAYS, {"count": 4}, compress)
             entry = store.get("extract", "ab12")
             assert entry is not None
@@ -17,6 +17,31 @@ def test_results_come_back(tmp_path):
                 np.testing.assert_array_equal(entry.arrays[name], values)
                 assert entry.arrays[name].dtype == values.dtype
     fsspec.filesystem("memory").rm("/steps", recursive=True)
+
+
+def test_named_arrays_come_back_alone_and_the_others_are_not_read(tmp_path):
+    store = Store(str(tmp_path))
+    store.put("extract", "ab12", {**ARRAYS, "large": np.zeros(1_000_000)}, {"count": 4})
+    entry = store.get("extract", "ab12", ["arm", "none"])
+    assert entry is not None
+    assert (set(entry.arrays), entry.info) == ({"arm"}, {"count": 4})
+    np.testing.assert_array_equal(entry.arrays["arm"], ARRAYS["arm"])
+    path = tmp_path / "extract" / "ab" / "ab12.npz"
+    content = bytearray(path.read_bytes())
+    content[4_000_000] ^= 0xFF  # in the large one
+    path.write_bytes(content)
+    assert store.get("extract", "ab12", ["arm"]) is not None
+    assert store.get("extract", "ab12") is None
+
+
+def test_only_named_arrays_are_compressed(tmp_path):
+    store, path = Store(str(tmp_path)), tmp_path / "a" / "00" / "00.npz"
+    arrays = {"a": np.zeros(50_000), "b": np.zeros(50_000)}
+    sizes = []
+    for compress in (False, ["a"], True):
+        store.put("a", "00", arrays, {}, compress)
+        sizes.append(path.stat().st_size)
+    assert sizes[0] > 800_000 > 500_000 > sizes[1] > 400_000 > 20_000 > sizes[2]
 
 
 def test_an_absent_result_is_none(tmp_path):

@@ -1,17 +1,55 @@
 """A simulated camera over ground with a pattern that has no symmetry, for the tests of mosaics."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from seamosaic.schemas.calibration import Camera
 from seamosaic.tasks import camera as cameras
-from seamosaic.tasks import rotations
-from seamosaic.tasks.mosaic import View
+from seamosaic.tasks import mosaic, nodes, rotations
 
 CAMERA = Camera(
     model="brown", width=320, height=240, fx=416.0, fy=420.0, cx=163.0, cy=117.0,
     distortion=(-0.08, 0.03, 0.0006, -0.0005, 0.0),
 )  # fmt: skip
+
+
+class View(NamedTuple):
+    """An image (H, W, 3), the pixels to erase (H, W), and where it was taken from."""
+
+    image: np.ndarray
+    erase: np.ndarray
+    camera: Camera
+    R_local_camera: np.ndarray
+    C_local: np.ndarray
+    number: int
+
+
+def shot_of(view, thumbnail=None):
+    scale = nodes.quality_scale(view.camera)
+    assert scale == 1
+    return nodes.Shot(view.number, view.camera, nodes.qualities(view.erase, scale), thumbnail)
+
+
+def shrunk(image, times):
+    size = -(-image.shape[1] // times), -(-image.shape[0] // times)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def compose(plans, views, **options):
+    """The mosaics of plans; every image that counts is asked for once."""
+    images, asked = {view.number: view.image for view in views}, []
+
+    def read(number, times):
+        asked.append(number)
+        return shrunk(images[number], times)
+
+    cell = plans[0].tile.cell_m
+    times = {view.number: mosaic.reduction(view.camera, view.C_local[2] + 3.0, cell) for view in views}
+    made = mosaic.compose(plans, read, times, **options)
+    assert len(set(asked)) == len(asked)
+    return made
 
 
 def pattern(x, y):

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from seamosaic.tasks import grids, mosaic
+from seamosaic.tasks import grids, mosaic, nodes
 from seamosaic.tasks.frames import LocalAffine, MapFrame
 from seamosaic.tasks.grids import Grid
 from seamosaic.tasks.terrain import Terrain
 
+from tests.tasks import seabed
 from tests.tasks.seabed import CAMERA, pattern, photograph, pose
 
 SAME = LocalAffine(np.eye(3), np.zeros(3))
@@ -27,11 +28,13 @@ def terrain_of(height, tile=TILE, halo_m=0.5, cell_m=0.02, local=SAME):
     return Terrain(height(*grids.cell_centres(grid)) if callable(height) else np.full(grid.shape, height), grid, local)
 
 
+def plan_of(tile, terrain, views, feather_m=0.02, **options):
+    shots = [(seabed.shot_of(view), nodes.lie(terrain.local, *view[3:5])) for view in views]
+    return mosaic.plan(tile, nodes.ground(tile, terrain), shots, feather_m=feather_m, **options)
+
+
 def compose(tile, terrain, views, feather_m=0.02):
-    canvas = mosaic.start(tile, terrain, feather_m)
-    for view in views:
-        canvas = mosaic.add_view(canvas, view)
-    return mosaic.finish(canvas)
+    return seabed.compose([plan_of(tile, terrain, views, feather_m)], views)[0]
 
 
 def truth(tile, origin=(0.0, 0.0)):
@@ -186,6 +189,11 @@ def test_holes_in_the_surface_and_images_elsewhere_leave_nothing():
     hole = (x > west) & (x < east) & (y > south) & (y < north)
     assert not result.mask[hole].any()
     assert result.mask[(x < west - 0.03)].mean() > 0.95
+    x, _ = grids.cell_centres(terrain.grid)
+    half = Terrain(np.where(x < -0.3, terrain.elevation, np.nan), terrain.grid, SAME)
+    wide = Grid(CELL, -100, 90, 600, 180)
+    over_nothing = view._replace(C_local=view.C_local + np.array([2.6, 0, 0]), number=1)
+    assert {laid.shot.number for laid in plan_of(wide, half, [view, over_nothing]).laid} == {0}
     nothing = compose(TILE, Terrain(np.full_like(terrain.elevation, np.nan), terrain.grid, SAME), [view])
     assert not nothing.mask.any()
 
@@ -209,3 +217,84 @@ def test_paint_over_fills_from_around():
     assert (error[~erase] == 0).all()
     assert 0 < error.max() < 20
     assert mosaic.paint_over(spoilt, np.zeros_like(erase)) is spoilt
+
+
+def test_images_that_count_nowhere_are_not_read():
+    left, right = two_views()
+    behind = photograph(
+        *pose(-0.33, 0.0, 0.9, 20), flat, 8
+    )  # as near as left, but outside of its image there is nothing
+    away = left._replace(C_local=left.C_local + np.array([50.0, 0, 0]), number=9)
+    made = plan_of(TILE, terrain_of(flat), [left, right, behind, away])
+    assert [laid.shot.number for laid in made.laid] == [3, 4, 8]
+    west = Grid(CELL, -200, 30, 60, 60)
+    made = plan_of(west, terrain_of(flat, west), [left, right])
+    assert [laid.shot.number for laid in made.laid] == [3]
+
+
+def test_mosaics_share_what_is_read():
+    views = list(two_views())
+    plans = [plan_of(TILE, terrain_of(flat), views), plan_of(TILE, terrain_of(flat), views[:1])]
+    both = seabed.compose(plans, views)  # asserts that no image is asked for twice
+    for made, alone in zip(both, (views, views[:1]), strict=True):
+        np.testing.assert_array_equal(made.rgb, compose(TILE, terrain_of(flat), alone).rgb)
+
+
+def plain_tone(u, v, range_m):
+    return np.ones((*u.shape, 3), np.float32), np.zeros((*u.shape, 3), np.float32)
+
+
+def seam_step(rgb):
+    """How much brighter it is just right of the seam at x = 0 than just left of it, as a share."""
+    x, _ = grids.cell_centres(TILE)
+    left, right = (rgb[:, (x > low) & (x < low + 0.03)].mean() for low in (-0.06, 0.03))
+    return right / left - 1
+
+
+def test_what_is_left_of_the_lighting_makes_no_seam():
+    left, right = two_views()
+    left, right = (view._replace(image=np.full_like(view.image, level)) for view, level in ((left, 100), (right, 120)))
+    results = []
+    for evened in (False, True):
+        thumbnails = [np.full((24, 32, 3), level / 255, np.float32) if evened else None for level in (100, 120)]
+        terrain = terrain_of(flat)
+        shots = [
+            (seabed.shot_of(view, small), nodes.lie(terrain.local, *view[3:5]))
+            for view, small in zip((left, right), thumbnails, strict=True)
+        ]
+        made = mosaic.plan(TILE, nodes.ground(TILE, terrain), shots, plain_tone)
+        results.append(seabed.compose([made], [left, right])[0].rgb)
+    assert seam_step(results[0]) > 0.15
+    assert 0.01 < seam_step(results[1]) < 0.08  # spread over decimetres
+    for rgb in results:  # far from it, the images are as they were
+        assert (rgb[:, 90, 5] == 100).all()
+        assert np.abs(rgb[:, 90, -5].astype(int) - 120).max() <= 1
+
+
+def test_light_is_what_is_mixed():
+    """Half of each of two greys is the grey of their mean light, not of their mean level."""
+    left, right = (
+        view._replace(image=np.full_like(view.image, k)) for view, k in zip(two_views(), (40, 200), strict=True)
+    )
+    terrain = terrain_of(flat)
+    made = plan_of(TILE, terrain, [left, right], feather_m=0.3)
+    mixed = seabed.compose([made], [left, right], gamma=2.2)[0].rgb[0, 90]
+    levels = seabed.compose([made], [left, right])[0].rgb[0, 90]
+    half = np.abs(levels.astype(int) - 120) <= 8
+    assert half.sum() > 3
+    assert np.abs(mixed[half] - 255 * (((40 / 255) ** 2.2 + (200 / 255) ** 2.2) / 2) ** (1 / 2.2)).max() < 12
+    assert (mixed[half] > levels[half] + 20).all()
+
+
+def test_a_steep_side_is_shown_by_the_image_that_faces_it():
+    def ramp(x, y):
+        return -3 + np.clip(1.2 * (x - 0.0), 0, 0.25)
+
+    def sources(height):
+        facing, above = photograph(*pose(-0.32, 0.0, 0.0), height, 0), photograph(*pose(0.48, 0.0, 0.0), height, 1)
+        return compose(TILE, terrain_of(height), [facing, above]).source
+
+    x, y = grids.cell_centres(TILE)
+    side = (x > 0.09) & (x < 0.13) & (np.abs(y) < 0.3)
+    assert (sources(ramp)[side] == 0).mean() > 0.9
+    assert (sources(flat)[side] == 0).mean() < 0.3

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
-from seamosaic.tasks import grids, mosaic, planar
+from seamosaic.tasks import grids, mosaic, nodes, planar
 from seamosaic.tasks.grids import Grid
 
+from tests.tasks import seabed
 from tests.tasks.seabed import pattern, photograph, pose
 
 TILE = Grid(0.006, -100, 90, 200, 180)
@@ -75,10 +76,10 @@ def test_without_matches_images_stay_where_they_are_believed():
 
 
 def mosaic_of(views, similarities):
-    canvas = planar.start(TILE)
-    for view, M in zip(views, similarities, strict=True):
-        canvas = planar.add_view(canvas, view, M)
-    return mosaic.finish(canvas)
+    shots = [
+        (seabed.shot_of(view), planar.lie(view.R_local_camera, M)) for view, M in zip(views, similarities, strict=True)
+    ]
+    return seabed.compose([mosaic.plan(TILE, nodes.flat_ground(TILE), shots)], views)[0]
 
 
 def test_flat_ground_comes_back_in_its_place():

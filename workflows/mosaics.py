@@ -1,0 +1,192 @@
+"""Orthomosaic and planar mosaic, per map tile: both from images that are read once, and the light of the mission."""
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ..schemas.calibration import Camera
+from ..tasks import camera, colour, frames, laser, mosaic, nodes, planar, terrain, water
+from ..tasks.frames import MapFrame
+from ..tasks.grids import Grid
+from ..tasks.navigation import Poses
+from ..tasks.nodes import Lie, Shot
+from . import extract, match, solve
+from .job import Done, Job, Made, code_version, load, once, stage
+from .maps import SURFACE, Image, MapJob, Pair, Tile, context, ground_around, paste, pose_digest
+from .solve import Solution
+
+LIGHTING, ALIGN, MOSAIC = "lighting", "planar-align", "mosaic"
+_VERSION = code_version(sys.modules[__name__])
+
+
+def lighting(m: MapJob, images: Sequence[Image]) -> Done:
+    """What lamps and water do to the mission's colours, from the thumbnails of some of its images."""
+    poses = solve.solution(load(m.job, solve.STEP, m.adjusted)).poses
+    gamma = m.job.parameters.mosaic.gamma
+
+    def make() -> Made:
+        light, away, exact = zip(*(_small(m.job, image, poses) for image in images), strict=True)
+        return Made(water.fit(np.stack(light), np.stack(away), np.stack(exact))._asdict(), {"images": len(images)})
+
+    heights = [(image.range_m, *np.round(poses.R_local_camera[image.row, 2], 6)) for image in images]
+    parameters = [gamma, *stage(m.job.calibration.camera), heights]
+    return once(m.job, LIGHTING, _VERSION, [image.key for image in images], parameters, make)
+
+
+def _small(job: Job, image: Image, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """An image's thumbnail as light, red green blue, how far away its cells are, and where this is known well."""
+    arrays = load(job, extract.STEP, image.key, ("thumbnail", "laser_uv", "laser_X")).arrays
+    uv, X = arrays.get("laser_uv", np.zeros((0, 2))), arrays.get("laser_X", np.zeros((0, 3)))
+    down = -poses.R_local_camera[image.row, 2]
+    away, exact = colour.ranges(job.calibration.camera, down, image.range_m, uv.astype(float), X.astype(float))
+    return colour.as_light(arrays["thumbnail"][..., ::-1], job.parameters.mosaic.gamma), away, exact
+
+
+def _inputs(tile: Tile, solution: Solution) -> list[str]:
+    return [*(f"{image.row}:{image.key}" for image in tile.images), pose_digest(solution, tile)]
+
+
+def _context(m: MapJob, tile: Tile) -> list[Any]:
+    return [*context(m, tile), m.max_interpolation_m, *stage(m.job.parameters.mosaic)]
+
+
+def align_planar(m: MapJob, images: Sequence[Image], linked: Sequence[Pair]) -> Done:
+    """Similarities of all images on the plane of the planar-scene hypothesis."""
+    solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
+    whole = Tile(Grid(1.0, 0, 0, 1, 1), tuple(images), tuple(linked))
+    inputs = [*_inputs(whole, solution), *(f"{pair.i}-{pair.j}:{pair.key}" for pair in linked)]
+
+    def make() -> Made:
+        rows = np.array([image.row for image in images], int)
+        if not len(rows):
+            return Made({"rows": rows, "similarity": np.zeros((0, 2, 3))}, {})
+        C_map = m.frame.map_from_local(solution.poses.C_local[rows])
+        above = np.array([image.range_m for image in images])
+        height, seabed = float(np.median(above)), float(np.median(C_map[:, 2] - above))
+        R_map_local = np.eye(3) if m.frame.crs is None else m.frame.R_map_local(C_map.mean(0))
+        believed = planar.prior(C_map, np.maximum(C_map[:, 2] - seabed, 0.1), R_map_local)
+        matches = _levelled(m, linked, solution.poses, {int(row): k for k, row in enumerate(rows)}, height)
+        return Made({"rows": rows, "similarity": planar.align(believed, matches, 0.1 * height)}, {})
+
+    context = [*_context(m, whole), [image.range_m for image in images]]
+    return once(m.job, ALIGN, _VERSION, inputs, context, make)
+
+
+def _levelled(m: MapJob, linked: Sequence[Pair], poses: Poses, number: dict[int, int], range_m: float):
+    """Matches of the linked pairs as levelled slopes."""
+    sides: tuple[list, list] = ([], [])
+    images: tuple[list, list] = ([], [])
+    for pair in linked:
+        arrays = load(m.job, match.STEP, pair.key, ("uv_i", "uv_j")).arrays
+        for side, row, uv in ((0, pair.i, arrays["uv_i"]), (1, pair.j, arrays["uv_j"])):
+            slopes = camera.normalised(m.job.calibration.camera, uv.astype(float), range_m)
+            sides[side].append(planar.level_slopes(poses.R_local_camera[row], slopes))
+            images[side].append(np.full(len(uv), number[row]))
+    none = [np.zeros((0, 2))], [np.zeros(0, int)]
+    xy_i, xy_j = (np.concatenate(side + none[0]) for side in sides)
+    image_i, image_j = (np.concatenate(side + none[1]) for side in images)
+    return planar.Matches(image_i.astype(int), image_j.astype(int), xy_i, xy_j)
+
+
+def mosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], aligned: Done, light: Done | None) -> Done:
+    """One tile of the orthomosaic over the surface tiles `ground`, and of the planar mosaic."""
+    solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
+    cell = tile.grid.cell_m
+    times = {image.row: mosaic.reduction(m.job.calibration.camera, image.range_m, cell) for image in tile.images}
+    inputs = [*_inputs(tile, solution), *(done.key for _, done in ground), aligned.key, light.key if light else ""]
+
+    def make() -> Made:
+        model = _model(m.job, light)
+        small = [model and _thumbnail(m.job, image, solution.poses, model) for image in tile.images]
+        shots = [_shot(m.job, image, thumbnail) for image, thumbnail in zip(tile.images, small, strict=True)]
+        tone = _tone(m.job.calibration.camera, model) if model else None
+        both = _on_surface(m, tile, ground, solution.poses), _on_plane(m, tile, aligned, solution.poses)
+        plans = [
+            mosaic.plan(tile.grid, place, [(shot, lies[shot.number]) for shot in shots], tone) for place, lies in both
+        ]
+        images = {image.row: image for image in tile.images}
+
+        def read(row: int, reduce: int) -> np.ndarray:
+            bgr = extract.read_verified(m.job, images[row].path, images[row].sha256, reduce)
+            return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+
+        cv2.setNumThreads(1)
+        ortho, flat = mosaic.compose(plans, read, times, m.job.parameters.mosaic.gamma if light else 1.0)
+        arrays = {**ortho._asdict(), "planar_rgb": flat.rgb, "planar_mask": flat.mask}
+        return Made(arrays, {"pixels": int(ortho.mask.sum())})
+
+    parameters = [*_context(m, tile), sorted(times.items())]
+    return once(m.job, MOSAIC, _VERSION, inputs, parameters, make, ("mask", "source", "planar_mask"))
+
+
+def _on_surface(
+    m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], poses: Poses
+) -> tuple[nodes.Ground, dict[int, Lie]]:
+    """The tile's nodes on the surface, and how its images lie to them."""
+    around = ground_around(tile.grid, ground[0][0].cell_m, m.max_interpolation_m)
+    elevation = np.full(around.shape, np.nan)
+    for grid, done in ground:
+        paste(around, elevation, grid, load(m.job, SURFACE, done.key, ("elevation",)).arrays["elevation"])
+    local = _affine(m.frame, tile.grid, elevation)
+    lies = {
+        image.row: nodes.lie(local, poses.R_local_camera[image.row], poses.C_local[image.row]) for image in tile.images
+    }
+    return nodes.ground(tile.grid, terrain.Terrain(elevation, around, local)), lies
+
+
+def _on_plane(m: MapJob, tile: Tile, aligned: Done, poses: Poses) -> tuple[nodes.Ground, dict[int, Lie]]:
+    """The tile's nodes on the plane of the planar-scene hypothesis, and how its images lie to them."""
+    entry = load(m.job, ALIGN, aligned.key)
+    similarity = dict(zip(entry.arrays["rows"].tolist(), entry.arrays["similarity"], strict=True))
+    lies = {image.row: planar.lie(poses.R_local_camera[image.row], similarity[image.row]) for image in tile.images}
+    return nodes.flat_ground(tile.grid), lies
+
+
+def _affine(frame: MapFrame, tile: Grid, elevation: np.ndarray) -> frames.LocalAffine:
+    """The map around a tile's middle."""
+    z = float(np.nanmean(elevation)) if np.isfinite(elevation).any() else 0.0
+    west, south, east, north = tile.bounds
+    return frame.affine_at(np.array([(west + east) / 2, (south + north) / 2, z]))
+
+
+def _shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
+    """An image without its pixels: which of them the laser lights, and its colours in small."""
+    entry = load(job, extract.STEP, image.key, ("line_uv",))
+    lens = job.calibration.camera
+    scale = nodes.quality_scale(lens)
+    shape = -(-lens.height // scale), -(-lens.width // scale)
+    erase = np.zeros(shape, bool)
+    if "line_uv" in entry.arrays:
+        u, v = np.floor((entry.arrays["line_uv"] + 0.5) / scale).astype(int).T
+        erase[np.clip(v, 0, shape[0] - 1), np.clip(u, 0, shape[1] - 1)] = True
+        line = np.argwhere(erase)[:, ::-1].astype(float)  # each pixel once
+        erase = laser.mask(shape, line, entry.info["halfwidth_px"] / scale + 0.5)
+    return Shot(image.row, lens, nodes.qualities(erase, scale), thumbnail)
+
+
+def _model(job: Job, light: Done | None) -> water.Water | None:
+    if light is None:
+        return None
+    a = load(job, LIGHTING, light.key).arrays
+    scalars = {name: a[name].item() for name in ("spreading", "range_m")}
+    return water.Water(light=a["light"], attenuation=a["attenuation"], veil=a["veil"], balance=a["balance"], **scalars)
+
+
+def _thumbnail(job: Job, image: Image, poses: Poses, model: water.Water) -> np.ndarray:
+    """An image's thumbnail without what lamps and water do."""
+    small, away, _ = _small(job, image, poses)
+    gain, veil = water.tone(model, model.light, away)
+    return water.without_holes(small * gain - veil)
+
+
+def _tone(lens: Camera, model: water.Water) -> mosaic.Tone:
+    def tone(u: np.ndarray, v: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return water.tone(model, nodes.small_at(model.light, lens, u, v), range_m)
+
+    return tone
+
+
+VERSIONS = dict.fromkeys((LIGHTING, ALIGN, MOSAIC), _VERSION)
