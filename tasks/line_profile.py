@@ -11,12 +11,15 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from .sheet_search import Arms, Piece, linear_light
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
+# Variance of pixels beside the line, and what a line's height and its square multiply that by.
+Noise = tuple[float, float, float]
 
 _CLIPPED: Final = 250
 # Half the window, where its ground begins and where the fit ends; sigmas of the line.
@@ -25,8 +28,10 @@ _APART: Final = 4.5
 _STEPS: Final = 4
 # Rows over which ground, width and noise are averaged.
 _GROUND_ROWS, _WIDTH_ROWS, _NOISE_ROWS = 9, 41, 31
+# Bands of height, of the usual line's, in which the noise is measured.
+_SHARES: Final = ((0.1, 0.35), (0.35, 0.65), (0.65, 1.0), (1.0, 2.0))
 _LEAST_SNR: Final = 4.0
-_LAG_ROWS: Final = 3
+_LAG_ROWS: Final = 5
 _TINY: Final = np.float32(1e-15)
 
 
@@ -252,7 +257,7 @@ def _gauss_newton(
 ) -> _Fit:
     zero = np.zeros((len(light), 1), np.float32)
     state = _State(zero, zero + np.float32(width), zero, light, (zero, zero, zero))
-    noise = (floor, 0.0)
+    noise = (floor, 0.0, 0.0)
     for k in range(_STEPS):
         state = _improved(state, light, used, x, noise, last=k == _STEPS - 1)
         noise = _noise(state, used, x, floor)
@@ -270,7 +275,7 @@ def _gauss_newton(
     return _Fit(*(np.asarray(field, float).ravel() for field in (u, sigma, state.width, snr)))
 
 
-def _improved(state: _State, light: Floats, used: Floats, x: Floats, noise: tuple[float, float], last: bool) -> _State:
+def _improved(state: _State, light: Floats, used: Floats, x: Floats, noise: Noise, last: bool) -> _State:
     """One step for offset, height and, but in the last, width."""
     t = (x - state.offset) / state.width
     g = np.exp(-0.5 * t * t)
@@ -307,26 +312,42 @@ def _sum(values: Floats) -> Floats:
     return values.sum(axis=1, keepdims=True)
 
 
-def _noise(state: _State, used: Floats, x: Floats, floor: float) -> tuple[float, float]:
-    """Variance of pixels beside the line, and by how much a line of mean height multiplies it, less 1."""
-    t = np.abs((x - state.offset) / state.width)[::3]
-    residual, seen = state.residual[::3], used[::3] > 0
-    outside, inside = residual[seen & (t > _GROUND)], residual[seen & (t < 1.2)]
-    if min(len(outside), len(inside)) < 20:
-        return floor, 0.0
-    beside, on = (max((1.4826 * float(np.median(np.abs(part)))) ** 2, floor) for part in (outside, inside))
+def _noise(state: _State, used: Floats, x: Floats, floor: float) -> Noise:
+    """What pixels' variances are beside the line and on it, from the residuals of every third row."""
+    t = (x - state.offset)[::3] / state.width[::3]
+    share = (_share(state)[::3] * np.exp(-0.5 * t * t))[used[::3] > 0]
+    residual, outer = state.residual[::3][used[::3] > 0], np.abs(t)[used[::3] > 0] > _GROUND
+    if outer.sum() < 20:
+        return floor, 0.0, 0.0
+    size, places = [residual[outer]], [0.0]
+    for low, high in _SHARES:
+        part = ~outer & (share > low) & (share < high)
+        if part.sum() > 20:
+            size.append(residual[part])
+            places.append(float(share[part].mean()))
+    variance = np.array([max((1.4826 * float(np.median(np.abs(part)))) ** 2, floor) for part in size])
     # height and place, fitted, take two of the pixels on the line
-    pixels = max(2.4 * float(np.median(state.width)), 2.5)
-    on *= pixels / (pixels - 1.5)
-    return beside, float(np.clip(on / beside - 1, 0, 100)) / 0.8
+    pixels = max(3.0 * float(np.median(state.width)), 3.0)
+    variance[1:] *= pixels / (pixels - 1.5)
+    place = np.array(places)
+    design = np.column_stack([np.ones_like(place), place, place**2]) / variance[:, None]
+    beside, linear, square = nnls(design, np.ones(len(place)))[0]
+    beside = max(beside, 0.5 * variance[0], floor)
+    return float(beside), float(linear / beside), float(square / beside)
 
 
-def _variance(state: _State, x: Floats, noise: tuple[float, float]) -> Floats | float:
-    if noise[1] == 0:
-        return noise[0]
+def _share(state: _State) -> Floats:
+    """Height of each row's line (N, 1) over that of most."""
+    return np.minimum(state.height / max(float(np.median(state.height)), 1e-9), 4)
+
+
+def _variance(state: _State, x: Floats, noise: Noise) -> Floats | float:
+    beside, linear, square = (np.float32(part) for part in noise)
+    if linear == 0 and square == 0:
+        return beside
     t = (x - state.offset) / state.width
-    share = np.minimum(state.height / max(float(np.median(state.height)), 1e-9), 4)
-    return np.float32(noise[0]) * (1 + np.float32(noise[1]) * share * np.exp(-0.5 * t * t))
+    on = _share(state) * np.exp(-0.5 * t * t)
+    return beside * (1 + on * (linear + square * on))
 
 
 def _noise_level(state: _State, weight: Floats, x: Floats) -> Floats:
@@ -341,12 +362,15 @@ def _noise_level(state: _State, weight: Floats, x: Floats) -> Floats:
 def _scatter_over_sigma(line: Line) -> float:
     """By how much points scatter about their neighbours on the line, over their sigmas: speckle is not in these."""
     u, v, variance, lag = line.uv[:, 0], line.uv[:, 1], line.sigma_px**2, _LAG_ROWS
-    if len(u) <= 2 * lag + 20:
+    if len(u) <= 4 * lag + 20:
         return 1.0
-    even = (v[2 * lag :] - v[lag:-lag] == lag) & (v[lag:-lag] - v[: -2 * lag] == lag)
-    off = u[lag:-lag] - 0.5 * (u[: -2 * lag] + u[2 * lag :])
-    expected = variance[lag:-lag] + 0.25 * (variance[: -2 * lag] + variance[2 * lag :])
+    # a fourth difference: curved bottom is no scatter
+    at = [slice(k * lag, len(u) - (4 - k) * lag) for k in range(5)]
+    weight = (1 / 6, -4 / 6, 1.0, -4 / 6, 1 / 6)
+    even = np.logical_and.reduce([v[at[k + 1]] - v[at[k]] == lag for k in range(4)])
     if even.sum() < 20:
         return 1.0
+    off = sum(w * u[part] for w, part in zip(weight, at, strict=True))
+    expected = sum(w**2 * variance[part] for w, part in zip(weight, at, strict=True))
     # median of a squared normal variable: 0.4549 of its variance
     return float(np.clip(np.sqrt(np.median(off[even] ** 2 / expected[even]) / 0.4549), 0.7, 20))

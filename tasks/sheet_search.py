@@ -194,7 +194,7 @@ def _peaks(seen: Floats, box: int, small: Reduced, parameters: LaserParameters) 
     height, scatter = _lobes(seen, box)
     strength = height / _local_scatter(scatter)
     top = cv2.dilate(strength, np.ones((1, 2 * (box // 2 + 1) + 1), np.uint8))
-    mask = (strength >= top) & (strength > parameters.curvature_sigmas)
+    mask = (strength >= top) & (strength > parameters.peak_sigmas)
     mask[:, 0] = mask[:, -1] = False
     row, column = np.nonzero(mask)
     before, at, after = (height[row, column + k].astype(float) for k in (-1, 0, 1))
