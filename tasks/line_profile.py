@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
@@ -31,7 +32,7 @@ _GROUND_ROWS, _WIDTH_ROWS, _NOISE_ROWS = 9, 41, 31
 # Bands of height, of the usual line's, in which the noise is measured.
 _SHARES: Final = ((0.1, 0.35), (0.35, 0.65), (0.65, 1.0), (1.0, 2.0))
 _LEAST_SNR: Final = 4.0
-_LAG_ROWS: Final = 5
+_LAG_ROWS: Final = 4
 _TINY: Final = np.float32(1e-15)
 
 
@@ -163,14 +164,25 @@ def _column_at(rows: _Rows, v: Indices) -> Array:
     return np.interp(v, rows.v[order], rows.u[order], left=np.nan, right=np.nan)
 
 
-def _strip(image: NDArray[np.uint8], v: Indices, centre: Indices, half: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Green levels (N, 2 half + 1) around a column in each row, and which of them are in the image."""
-    width = image.shape[1]
-    column = centre[:, None] + np.arange(-half, half + 1)
-    flat = v[:, None] * width + np.clip(column, 0, width - 1)
-    if image.ndim == 3:
-        flat = flat * 3 + 1
-    return image.reshape(-1).take(flat), (column >= 0) & (column < width)
+def _strip(
+    image: NDArray[np.uint8], v: Indices, centre: Indices, half: int
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Green levels (N, 2 half + 1) around a column in each row, and which of them are in the image.
+
+    Those that are not repeat the row's last pixel.
+    """
+    width, size = image.shape[1], 2 * half + 1
+    green = image[..., 1] if image.ndim == 3 else image
+    step = green.strides[1]
+    # windows of consecutive pixels, of any start: the rows of an image lie one behind the other
+    windows = as_strided(green, (green.size - size + 1, size), (step, step), writeable=False)
+    level = windows[np.clip(v * width + centre - half, 0, len(windows) - 1)]
+    inside = np.ones(level.shape, bool)
+    cut = np.flatnonzero((centre < half) | (centre >= width - half))
+    column = centre[cut, None] + np.arange(-half, half + 1)
+    inside[cut] = (column >= 0) & (column < width)
+    level[cut] = green[v[cut, None], np.clip(column, 0, width - 1)]
+    return level, inside
 
 
 def _centred(image: NDArray[np.uint8], rows: _Rows, box_px: float, factor: int) -> _Rows:
@@ -213,20 +225,33 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     """Gaussians of all rows of an arm by Gauss and Newton's steps, side by side."""
     centre = np.round(rows.u).astype(np.intp)
     width = _typical_width(linear[_strip(image, rows.v, centre, int(np.ceil(1.7 * box_px)) + 2)[0]])
-    half = int(np.ceil(_WINDOW * 1.1 * width)) + 1
-    level, used = _strip(image, rows.v, centre, half)
-    light = linear[level]
+    # columns of a wide line are averaged: nothing is lost as long as they are narrower than the line
+    columns = 1 + 2 * int(width / 4)
+    half = int(np.ceil(_WINDOW * 1.1 * width / columns)) + 1
+    level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
+    light = np.asarray(cv2.LUT(level, linear), np.float32)
+    size = (2 * half + 1, len(light))
+    if columns > 1:
+        light = np.asarray(cv2.resize(light, size, interpolation=cv2.INTER_AREA), np.float32)
     x = np.arange(-half, half + 1, dtype=np.float32)
-    apart = (rows.other - centre).astype(np.float32)[:, None]
-    near_other = np.abs(apart) < half + _FIT * width
-    if near_other.any():
+    used, unclipped = (part.reshape(*size[::-1], columns).all(axis=2) for part in (inside, level < _CLIPPED))
+    apart, width = (rows.other - centre).astype(np.float32)[:, None] / columns, width / columns
+    if (np.abs(apart) < half + _FIT * width).any():
         used &= ~(np.abs(x - apart) < _FIT * width)
-    ground = _ground(light, used, x, _GROUND * width)
-    light -= ground
-    used &= level < _CLIPPED
-    step = linear[1 + int(np.median(level[:, ::3]))] - linear[int(np.median(level[:, ::3]))]
-    floor = max(float(step) ** 2 / 12, 1e-10)
-    return _gauss_newton(light, used.astype(np.float32), x, width, floor, rows._replace(u=centre.astype(float)), image.shape[1])
+    light -= _ground(light, used, x, _GROUND * width)
+    used &= unclipped
+    typical = int(np.median(level[::7, ::3]))
+    floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
+    fit = _gauss_newton(light, used.astype(np.float32), x, width, floor)
+    return _accepted(fit._replace(u=centre + columns * fit.u, sigma=columns * fit.sigma, width=columns * fit.width), rows, image.shape[1])
+
+
+def _accepted(fit: _Fit, rows: _Rows, columns: int) -> _Fit:
+    """Columns set to NaN where nothing is sure to have been measured, or only half of it could be seen."""
+    bad = (fit.signal_to_noise < _LEAST_SNR) | (np.abs(fit.u - rows.u) > 2 * fit.width + 1)
+    bad |= (fit.u < 0.7 * fit.width) | (fit.u > columns - 1 - 0.7 * fit.width)
+    bad |= np.abs(rows.other - fit.u) < _APART * fit.width
+    return fit._replace(u=np.where(bad, np.nan, fit.u))
 
 
 def _ground(light: Floats, used: NDArray[np.bool_], x: Floats, begin: float) -> Floats:
@@ -252,27 +277,21 @@ class _State(NamedTuple):
     normals: tuple[Floats, Floats, Floats]
 
 
-def _gauss_newton(
-    light: Floats, used: Floats, x: Floats, width: float, floor: float, rows: _Rows, columns: int
-) -> _Fit:
+def _gauss_newton(light: Floats, used: Floats, x: Floats, width: float, floor: float) -> _Fit:
+    """Fits profiles (N, M), in pixels from their middle."""
     zero = np.zeros((len(light), 1), np.float32)
     state = _State(zero, zero + np.float32(width), zero, light, (zero, zero, zero))
     noise = (floor, 0.0, 0.0)
     for k in range(_STEPS):
         state = _improved(state, light, used, x, noise, last=k == _STEPS - 1)
-        noise = _noise(state, used, x, floor)
-    weight = used / _variance(state, x, noise)
-    level = _noise_level(state, weight, x)
+        if k < _STEPS - 1:
+            noise = _noise(state, used, x, floor)
+    level = _noise_level(state, used / _variance(state, x, noise), x)
     gg, gd, dd = state.normals
     determinant = np.maximum(gg * dd - gd**2, _TINY)
     snr = state.height * np.sqrt(determinant / np.maximum(dd, _TINY)) / level
     sigma = level * np.sqrt(gg / determinant) / np.maximum(state.height, 1e-9)
-    u = rows.u[:, None] + state.offset
-    bad = (snr < _LEAST_SNR) | (np.abs(state.offset) > 2 * state.width + 1)
-    bad |= (u < 0.7 * state.width) | (u > columns - 1 - 0.7 * state.width)
-    bad |= np.abs(rows.other[:, None] - u) < _APART * state.width
-    u = np.where(bad, np.nan, u)
-    return _Fit(*(np.asarray(field, float).ravel() for field in (u, sigma, state.width, snr)))
+    return _Fit(*(np.asarray(field, float).ravel() for field in (state.offset, sigma, state.width, snr)))
 
 
 def _improved(state: _State, light: Floats, used: Floats, x: Floats, noise: Noise, last: bool) -> _State:
@@ -362,6 +381,8 @@ def _noise_level(state: _State, weight: Floats, x: Floats) -> Floats:
 def _scatter_over_sigma(line: Line) -> float:
     """By how much points scatter about their neighbours on the line, over their sigmas: speckle is not in these."""
     u, v, variance, lag = line.uv[:, 0], line.uv[:, 1], line.sigma_px**2, _LAG_ROWS
+    # farther than speckle and stones as wide as the line reach
+    lag = max(lag, round(2 * float(np.median(line.width_px)))) if len(u) else lag
     if len(u) <= 4 * lag + 20:
         return 1.0
     # a fourth difference: curved bottom is no scatter

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
-_WIDTH_PX: Final = 900
+_WIDTH_PX: Final = 600
 _SMALLEST_PX: Final = 100
 # What the laser adds to blue, green and red, of linear light; filters are never as narrow as that of the laser.
 _LASER_BGR: Final = np.array([0.2, 1.0, 0.15])
@@ -99,7 +99,7 @@ class Arms(NamedTuple):
 
 
 def reduce(image_bgr: NDArray[np.uint8]) -> Reduced:
-    """An image (H, W[, 3]) about 900 pixels wide."""
+    """An image (H, W[, 3]) about 600 pixels wide."""
     factor = max(1, round(image_bgr.shape[1] / _WIDTH_PX))
     height, width = (side // factor for side in image_bgr.shape[:2])
     first = (factor - 1) // 2
