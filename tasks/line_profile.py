@@ -12,28 +12,20 @@ import cv2
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
+from . import gaussian_fit
 from .sheet_search import Arms, Piece, linear_light
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
-# Variance of pixels beside the line, and what a line's height and its square multiply that by.
-Noise = tuple[float, float, float]
 
 _CLIPPED: Final = 250
-# Half the window, where its ground begins and where the fit ends; sigmas of the line.
-_WINDOW, _GROUND, _FIT = 4.5, 3.2, 3.0
+# Arms nearer than so many widths of the line are not told apart.
 _APART: Final = 4.5
-_STEPS: Final = 4
-# Rows over which ground, width and noise are averaged.
-_GROUND_ROWS, _WIDTH_ROWS, _NOISE_ROWS = 9, 41, 31
-# Bands of height, of the usual line's, in which the noise is measured.
-_SHARES: Final = ((0.1, 0.35), (0.35, 0.65), (0.65, 1.0), (1.0, 2.0))
 _LEAST_SNR: Final = 4.0
-_LAG_ROWS: Final = 4
-_TINY: Final = np.float32(1e-15)
+# Neighbours that scatter is measured by, rows; at least, and in widths.
+_LAG_ROWS, _LAG_WIDTHS = 4, 2.0
 
 
 class Line(NamedTuple):
@@ -93,7 +85,10 @@ def measure(image_bgr: NDArray[np.uint8], arms: Arms, factor: int, gamma: float)
     gamma : the camera's.
     """
     image = np.ascontiguousarray(image_bgr)
-    rows = [_centred(image, _rows_of(pieces, factor, arms.box_px, image.shape), arms.box_px, factor) for pieces in arms.pieces]
+    rows = [
+        _centred(image, _rows_of(pieces, factor, arms.box_px, image.shape), arms.box_px, factor)
+        for pieces in arms.pieces
+    ]
     found = []
     for arm, (own, other) in enumerate([(rows[0], rows[1]), (rows[1], rows[0])]):
         if len(own.v) < _LAG_ROWS:
@@ -186,30 +181,42 @@ def _strip(
 
 
 def _centred(image: NDArray[np.uint8], rows: _Rows, box_px: float, factor: int) -> _Rows:
-    """Rough columns improved at full resolution: the strongest peak near them, of five rows together."""
+    """Rough columns improved at full resolution: the strongest peak near them, of some rows together."""
     if not len(rows.v):
         return rows
-    reach = factor + 1
-    wide = int(np.ceil(1.5 * box_px)) + 1
-    centre = np.round(rows.u).astype(np.intp)
-    level = _strip(image, rows.v, centre, reach + wide)[0].astype(np.float32)
-    sigma = max(0.4 * box_px, 0.8)
-    narrow = cv2.GaussianBlur(cv2.blur(level, (1, 5)), (0, 0), sigmaX=sigma, sigmaY=1e-3)
+    every, columns = max(1, factor // 2), 1 + 2 * int(box_px / 8)
+    reach, wide = factor // columns + 1, int(np.ceil(1.5 * box_px / columns)) + 1
+    v, centre = rows.v[::every], np.round(rows.u[::every]).astype(np.intp)
+    half = reach + wide
+    level = _averaged(_strip(image, v, centre, half * columns + columns // 2)[0], columns)
+    sigma = max(0.4 * box_px / columns, 0.8)
+    narrow = cv2.GaussianBlur(cv2.blur(level, (1, 5 if every == 1 else 3)), (2 * int(2.5 * sigma) + 1, 1), sigma)
     broad = cv2.blur(narrow, (2 * wide + 1, 1))
     near = slice(wide, wide + 2 * reach + 1)
-    return rows._replace(u=centre + np.argmax(narrow[:, near] - broad[:, near], axis=1) - float(reach))
+    best = np.argmax(narrow[:, near] - broad[:, near], axis=1) - reach
+    off = centre + columns * best - rows.u[::every]
+    return rows._replace(u=rows.u + np.interp(np.arange(len(rows.v)), np.arange(len(v)) * every, off))
+
+
+def _averaged(values: NDArray, columns: int) -> Floats:
+    """Means (N, M) of so many columns of (N, columns M)."""
+    values = values.astype(np.float32, copy=False)
+    if columns == 1:
+        return values
+    size = (values.shape[1] // columns, len(values))
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 # -------------------------------------------------------------------------------------------- profiles
 
 
-def _typical_width(light: Floats) -> float:
-    """Standard deviation in pixels of the median profile of strips (N, M) centred on the line to a pixel or so."""
-    half = light.shape[1] // 2
-    some = light[:: max(1, len(light) // 300)]
+def _typical_width(image: NDArray[np.uint8], v: Indices, centre: Indices, box_px: float, linear: Floats) -> float:
+    """Standard deviation in pixels of the median profile of rows in which the line's column is known to a pixel."""
+    half, some = int(np.ceil(1.7 * box_px)) + 2, slice(None, None, max(1, len(v) // 300))
+    light = linear[_strip(image, v[some], centre[some], half)[0]]
     ends = max(1, half // 4)
-    ground = 0.5 * (some[:, :ends].mean(axis=1) + some[:, -ends:].mean(axis=1))
-    profile = np.median(some - ground[:, None], axis=0).astype(float)
+    ground = 0.5 * (light[:, :ends].mean(axis=1) + light[:, -ends:].mean(axis=1))
+    profile = np.median(light - ground[:, None], axis=0).astype(float)
     x = np.arange(-half, half + 1)
     sigma = half / 3
     for _ in range(12):
@@ -222,28 +229,35 @@ def _typical_width(light: Floats) -> float:
 
 
 def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -> _Fit:
-    """Gaussians of all rows of an arm by Gauss and Newton's steps, side by side."""
+    """Gaussians of all rows of an arm."""
     centre = np.round(rows.u).astype(np.intp)
-    width = _typical_width(linear[_strip(image, rows.v, centre, int(np.ceil(1.7 * box_px)) + 2)[0]])
+    width = _typical_width(image, rows.v, centre, box_px, linear)
     # columns of a wide line are averaged: nothing is lost as long as they are narrower than the line
     columns = 1 + 2 * int(width / 4)
-    half = int(np.ceil(_WINDOW * 1.1 * width / columns)) + 1
+    half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
     level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
-    light = np.asarray(cv2.LUT(level, linear), np.float32)
-    size = (2 * half + 1, len(light))
-    if columns > 1:
-        light = np.asarray(cv2.resize(light, size, interpolation=cv2.INTER_AREA), np.float32)
-    x = np.arange(-half, half + 1, dtype=np.float32)
-    used, unclipped = (part.reshape(*size[::-1], columns).all(axis=2) for part in (inside, level < _CLIPPED))
-    apart, width = (rows.other - centre).astype(np.float32)[:, None] / columns, width / columns
-    if (np.abs(apart) < half + _FIT * width).any():
-        used &= ~(np.abs(x - apart) < _FIT * width)
-    light -= _ground(light, used, x, _GROUND * width)
-    used &= unclipped
+    light = _averaged(np.asarray(cv2.LUT(level, linear), np.float32), columns)
+    used, unclipped = _all(inside, columns), _all(level < _CLIPPED, columns)
+    used &= ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns)
+    light -= gaussian_fit.ground(light, used, width / columns)
     typical = int(np.median(level[::7, ::3]))
     floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
-    fit = _gauss_newton(light, used.astype(np.float32), x, width, floor)
-    return _accepted(fit._replace(u=centre + columns * fit.u, sigma=columns * fit.sigma, width=columns * fit.width), rows, image.shape[1])
+    found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
+    u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
+    return _accepted(_Fit(u, sigma, width, found.signal_to_noise), rows, image.shape[1])
+
+
+def _all(pixels: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:
+    """Which groups (N, M) of columns of (N, columns M) are true in every column."""
+    return np.logical_and.reduce([pixels[:, k::columns] for k in range(columns)])
+
+
+def _lit_by_other(apart: Array, half: int, reach: float) -> NDArray[np.bool_]:
+    """Pixels (N, 2 half + 1) on which the other arm, so far from the middle (N,), shines."""
+    lit = np.zeros((len(apart), 2 * half + 1), bool)
+    near = np.flatnonzero(np.abs(apart) < half + reach)
+    lit[near] = np.abs(np.arange(-half, half + 1) - apart[near, None]) < reach
+    return lit
 
 
 def _accepted(fit: _Fit, rows: _Rows, columns: int) -> _Fit:
@@ -254,135 +268,11 @@ def _accepted(fit: _Fit, rows: _Rows, columns: int) -> _Fit:
     return fit._replace(u=np.where(bad, np.nan, fit.u))
 
 
-def _ground(light: Floats, used: NDArray[np.bool_], x: Floats, begin: float) -> Floats:
-    """Straight line through what lies to both sides of each profile, averaged over some rows."""
-    mean, place = [], []
-    for side in (x < -begin, x > begin):
-        count = used[:, side].sum(axis=1, dtype=np.float32)[:, None]
-        total = (light[:, side] * used[:, side]).sum(axis=1, dtype=np.float32)[:, None]
-        count, total = (cv2.blur(part, (1, _GROUND_ROWS), borderType=cv2.BORDER_REFLECT) for part in (count, total))
-        mean.append(np.where(count > 1e-3, total / np.maximum(count, 1e-3), np.nan).reshape(-1, 1))
-        place.append(float(x[side].mean()))
-    left, right = (np.where(np.isnan(a), np.where(np.isnan(b), 0, b), a) for a, b in (mean, mean[::-1]))
-    return (left + (right - left) * ((x - place[0]) / (place[1] - place[0]))).astype(np.float32)
-
-
-class _State(NamedTuple):
-    """Of each row (N, 1): offset of the line from the strip's middle, width, height, residuals (N, M) and normals."""
-
-    offset: Floats
-    width: Floats
-    height: Floats
-    residual: Floats
-    normals: tuple[Floats, Floats, Floats]
-
-
-def _gauss_newton(light: Floats, used: Floats, x: Floats, width: float, floor: float) -> _Fit:
-    """Fits profiles (N, M), in pixels from their middle."""
-    zero = np.zeros((len(light), 1), np.float32)
-    state = _State(zero, zero + np.float32(width), zero, light, (zero, zero, zero))
-    noise = (floor, 0.0, 0.0)
-    for k in range(_STEPS):
-        state = _improved(state, light, used, x, noise, last=k == _STEPS - 1)
-        if k < _STEPS - 1:
-            noise = _noise(state, used, x, floor)
-    level = _noise_level(state, used / _variance(state, x, noise), x)
-    gg, gd, dd = state.normals
-    determinant = np.maximum(gg * dd - gd**2, _TINY)
-    snr = state.height * np.sqrt(determinant / np.maximum(dd, _TINY)) / level
-    sigma = level * np.sqrt(gg / determinant) / np.maximum(state.height, 1e-9)
-    return _Fit(*(np.asarray(field, float).ravel() for field in (state.offset, sigma, state.width, snr)))
-
-
-def _improved(state: _State, light: Floats, used: Floats, x: Floats, noise: Noise, last: bool) -> _State:
-    """One step for offset, height and, but in the last, width."""
-    t = (x - state.offset) / state.width
-    g = np.exp(-0.5 * t * t)
-    weight = used * (np.abs(t) < _FIT) / _variance(state, x, noise)
-    slope = g * t / state.width
-    wg = weight * g
-    gg, gd, dd = _sum(wg * g), _sum(wg * slope), _sum(weight * slope * slope)
-    gp, dp = _sum(wg * light), _sum(weight * slope * light)
-    determinant = np.maximum(gg * dd - gd * gd, _TINY)
-    height = np.maximum((dd * gp - gd * dp) / determinant, 1e-7)
-    step = (gg * dp - gd * gp) / determinant / height
-    residual = light - height * g
-    width = state.width
-    if not last:
-        width = _wider(state, residual, weight, g, t, height, wg, gg)
-    offset = state.offset + np.clip(step, -state.width, state.width)
-    return _State(np.clip(offset, x[0], x[-1]), width, height, residual, (gg, gd, dd))
-
-
-def _wider(
-    state: _State, residual: Floats, weight: Floats, g: Floats, t: Floats, height: Floats, wg: Floats, gg: Floats
-) -> Floats:
-    """Widths that fit better, one for some rows together."""
-    bulge = g * t * t / state.width
-    bulge -= g * (_sum(wg * bulge) / np.maximum(gg, _TINY))
-    bulge *= weight
-    up, down = height * _sum(bulge * residual), height**2 * _sum(bulge * g * t * t / state.width)
-    up, down = (cv2.blur(part, (1, _WIDTH_ROWS), borderType=cv2.BORDER_REFLECT).reshape(-1, 1) for part in (up, down))
-    change = np.clip(up / np.maximum(down, _TINY), -0.2 * state.width, 0.2 * state.width)
-    return np.maximum(state.width + change, 0.5)
-
-
-def _sum(values: Floats) -> Floats:
-    return values.sum(axis=1, keepdims=True)
-
-
-def _noise(state: _State, used: Floats, x: Floats, floor: float) -> Noise:
-    """What pixels' variances are beside the line and on it, from the residuals of every third row."""
-    t = (x - state.offset)[::3] / state.width[::3]
-    share = (_share(state)[::3] * np.exp(-0.5 * t * t))[used[::3] > 0]
-    residual, outer = state.residual[::3][used[::3] > 0], np.abs(t)[used[::3] > 0] > _GROUND
-    if outer.sum() < 20:
-        return floor, 0.0, 0.0
-    size, places = [residual[outer]], [0.0]
-    for low, high in _SHARES:
-        part = ~outer & (share > low) & (share < high)
-        if part.sum() > 20:
-            size.append(residual[part])
-            places.append(float(share[part].mean()))
-    variance = np.array([max((1.4826 * float(np.median(np.abs(part)))) ** 2, floor) for part in size])
-    # height and place, fitted, take two of the pixels on the line
-    pixels = max(3.0 * float(np.median(state.width)), 3.0)
-    variance[1:] *= pixels / (pixels - 1.5)
-    place = np.array(places)
-    design = np.column_stack([np.ones_like(place), place, place**2]) / variance[:, None]
-    beside, linear, square = nnls(design, np.ones(len(place)))[0]
-    beside = max(beside, 0.5 * variance[0], floor)
-    return float(beside), float(linear / beside), float(square / beside)
-
-
-def _share(state: _State) -> Floats:
-    """Height of each row's line (N, 1) over that of most."""
-    return np.minimum(state.height / max(float(np.median(state.height)), 1e-9), 4)
-
-
-def _variance(state: _State, x: Floats, noise: Noise) -> Floats | float:
-    beside, linear, square = (np.float32(part) for part in noise)
-    if linear == 0 and square == 0:
-        return beside
-    t = (x - state.offset) / state.width
-    on = _share(state) * np.exp(-0.5 * t * t)
-    return beside * (1 + on * (linear + square * on))
-
-
-def _noise_level(state: _State, weight: Floats, x: Floats) -> Floats:
-    """Scatter of the residuals (N, 1) over what the weights expect, of some rows together."""
-    inside = np.abs((x - state.offset) / state.width) < _WINDOW
-    squares = np.minimum(weight * state.residual**2, 16) * inside
-    count = np.maximum(_sum((weight > 0) * inside.astype(np.float32)) - 2, 0.5)
-    up, down = (cv2.blur(part, (1, _NOISE_ROWS), borderType=cv2.BORDER_REFLECT) for part in (_sum(squares), count))
-    return np.sqrt(np.clip(up / down, 0.3, 30)).reshape(-1, 1)
-
-
 def _scatter_over_sigma(line: Line) -> float:
     """By how much points scatter about their neighbours on the line, over their sigmas: speckle is not in these."""
-    u, v, variance, lag = line.uv[:, 0], line.uv[:, 1], line.sigma_px**2, _LAG_ROWS
-    # farther than speckle and stones as wide as the line reach
-    lag = max(lag, round(2 * float(np.median(line.width_px)))) if len(u) else lag
+    u, v, variance = line.uv[:, 0], line.uv[:, 1], line.sigma_px**2
+    # farther apart than speckle and stones reach
+    lag = max(_LAG_ROWS, round(_LAG_WIDTHS * float(np.median(line.width_px)))) if len(u) else _LAG_ROWS
     if len(u) <= 4 * lag + 20:
         return 1.0
     # a fourth difference: curved bottom is no scatter

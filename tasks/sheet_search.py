@@ -131,8 +131,10 @@ def search(small: Reduced, camera: Camera, light: Laser, parameters: LaserParame
     taken = np.zeros(len(peaks.row), bool)
     for members in found[first].members:
         taken[members] = True
-    rest = np.flatnonzero(~taken)
-    second = _arm(peaks.take(rest), inverse_depth[1 - first][rest], height, parameters)
+    second, rest = found[1 - first], np.arange(len(taken))
+    if any(taken[members].any() for members in second.members):
+        rest = np.flatnonzero(~taken)
+        second = _arm(peaks.take(rest), inverse_depth[1 - first][rest], height, parameters)
     pieces = [[_piece(peaks, m) for m in found[first].members], [_piece(peaks, rest[m]) for m in second.members]]
     return Arms((pieces[first], pieces[1 - first]), float(box * small.factor))
 
@@ -149,7 +151,7 @@ def evidence(image: NDArray[np.uint8], gamma: float) -> Floats:
     some = light[2::5]
     if np.abs(some - some[..., 1:2]).mean() < 0.002:
         return np.ascontiguousarray(light[..., 1])
-    rough = (some - cv2.blur(some, (15, 1))).reshape(-1, 3)[::3]
+    rough = (some - cv2.blur(some, (15, 1))).reshape(-1, 3)[::5]
     limit = 4.5 * np.median(np.abs(rough), axis=0) + 1e-5
     rough = np.clip(rough, -limit, limit)
     scatter = (rough.T @ rough / len(rough)).astype(float)
@@ -180,13 +182,13 @@ def _lobes(seen: Floats, box: int) -> tuple[Floats, Floats]:
 
 def _best_box(seen: Floats) -> int:
     """The box that the line fills best: where the strongest peak of a row stands highest above the scatter."""
-    rows = np.ascontiguousarray(seen[4::9])
+    rows = np.ascontiguousarray(seen[4::12])
     strength = []
     for box in _BOXES:
         if 6 * box > seen.shape[1]:
             break
         height, scatter = _lobes(rows, box)
-        strength.append(float(np.median(height.max(axis=1))) / max(float(np.median(np.abs(scatter))), 1e-6))
+        strength.append(float(np.median(height.max(axis=1))) / max(float(np.median(np.abs(scatter[:, ::3]))), 1e-6))
     return _BOXES[int(np.argmax(strength))]
 
 
@@ -233,7 +235,9 @@ def inverse_depths(camera: Camera, light: Laser, small: Reduced, peaks: Peaks) -
 def _sampled(nodes: Floats, at: Floats) -> Array:
     """Values (N,) of a grid at fractional columns and rows (2, N, 1)."""
     pieces = [
-        cv2.remap(nodes, at[0, k : k + 30_000], at[1, k : k + 30_000], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        cv2.remap(
+            nodes, at[0, k : k + 30_000], at[1, k : k + 30_000], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         for k in range(0, at.shape[1], 30_000)
     ]
     return np.concatenate([np.zeros((0, 1)), *pieces])[:, 0].astype(np.float64)
@@ -291,19 +295,21 @@ def _linked(row: Indices, place: Array) -> NDArray[np.int32]:
     scale = 4 * (float(np.ptp(place)) + 10)
     key = row * scale + (place - place.min())
     order = np.argsort(key)
-    key, row_sorted = key[order], row[order]
+    key = key[order]
     below, above = np.full(count, -1), np.full(count, -1)
     for gap in range(1, _REACH_ROWS + 1):
         start, goal = np.flatnonzero(below < 0), np.flatnonzero(above < 0)
         reach = _NOISE_PX + _SLOPE_PX * gap
-        down, up = _nearest(key[start] + gap * scale, key[goal], reach), _nearest(key[goal] - gap * scale, key[start], reach)
+        down, up = (
+            _nearest(key[start] + gap * scale, key[goal], reach),
+            _nearest(key[goal] - gap * scale, key[start], reach),
+        )
         mutual = np.flatnonzero((down >= 0) & (up[down] == np.arange(len(start))))
         below[start[mutual]], above[goal[down[mutual]]] = goal[down[mutual]], start[mutual]
     top = np.flatnonzero(below >= 0)
     links = coo_array((np.ones(len(top), np.int8), (top, below[top])), shape=(count, count))
     chain = np.empty(count, np.int32)
     chain[order] = connected_components(links, directed=False)[1]
-    assert len(row_sorted) == count
     return chain
 
 

@@ -70,12 +70,12 @@ def triangulate(camera: Camera, light: Laser, uv: Array, arm: NDArray, sigma_px:
     """
     uv = np.asarray(uv, float).reshape(-1, 2)
     X, sigma = np.full((len(uv), 3), np.nan), np.full(len(uv), np.nan)
-    half = np.array([0.5, 0.0])
+    tenth = np.array([0.1, 0.0])
     for number, sheet in enumerate(light.sheets):
         own = np.asarray(arm) == number
-        X[own] = intersect(camera, sheet, uv[own])[0]
-        change = intersect(camera, sheet, uv[own] + half)[1] - intersect(camera, sheet, uv[own] - half)[1]
-        sigma[own] = np.abs(change) * np.asarray(sigma_px)[own]
+        X[own], distance = intersect(camera, sheet, uv[own])
+        change = intersect(camera, sheet, uv[own] + tenth)[1] - distance
+        sigma[own] = 10 * np.abs(change) * np.asarray(sigma_px)[own]
     return Soundings(uv, np.asarray(arm).astype(np.uint8), X, sigma)
 
 
@@ -173,7 +173,9 @@ def sound(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters
     return _sound_sheets(image_bgr, camera, light, parameters)
 
 
-def _sound_sheets(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters) -> ImageSoundings:
+def _sound_sheets(
+    image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters
+) -> ImageSoundings:
     small = sheet_search.reduce(image_bgr)
     arms = sheet_search.search(small, camera, light, parameters)
     line = line_profile.measure(image_bgr, arms, small.factor, parameters.gamma)
@@ -196,7 +198,9 @@ def _no_cross(points: int, on_cross: int) -> str:
     return f"no laser cross found: {points} points on lines of light, {on_cross} of them on the cross"
 
 
-def _sound_paper(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters) -> ImageSoundings:
+def _sound_paper(
+    image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters
+) -> ImageSoundings:
     points = laser.detect(image_bgr, parameters)
     if len(points.uv) < parameters.min_soundings:
         return nothing("no laser found")
