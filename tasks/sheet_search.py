@@ -34,8 +34,10 @@ _GRID_PX: Final = 48
 _REACH_ROWS: Final = 3
 _NOISE_PX: Final = 1.0
 _SLOPE_PX: Final = 0.6
-# Points, of 900 rows, that a piece needs to stand out by its whole range from its neighbours on the arm.
+_STEEP_PX: Final = 1.5
+# Points, of 900 rows, that a jump costs: by the whole range; and any jump.
 _JUMP_POINTS: Final = 80.0
+_STEP_POINTS: Final = 6.0
 _PIECES: Final = 250
 
 
@@ -124,19 +126,24 @@ def search(small: Reduced, camera: Camera, light: Laser, parameters: LaserParame
     box = _best_box(seen)
     peaks = _peaks(seen, box, small, parameters)
     inverse_depth = inverse_depths(camera, light, small, peaks)
-    height = len(seen)
-    found = [_arm(peaks, q, height, parameters) for q in inverse_depth]
-    first = int(found[1].gain > found[0].gain)
-    # a peak has one arm: the one that more speaks for
-    taken = np.zeros(len(peaks.row), bool)
-    for members in found[first].members:
-        taken[members] = True
-    second, rest = found[1 - first], np.arange(len(taken))
-    if any(taken[members].any() for members in second.members):
-        rest = np.flatnonzero(~taken)
-        second = _arm(peaks.take(rest), inverse_depth[1 - first][rest], height, parameters)
-    pieces = [[_piece(peaks, m) for m in found[first].members], [_piece(peaks, rest[m]) for m in second.members]]
-    return Arms((pieces[first], pieces[1 - first]), float(box * small.factor))
+    found = _both(peaks, inverse_depth, len(seen), parameters)
+    pieces = [[_piece(peaks, m) for m in arm.members] for arm in found]
+    return Arms((pieces[0], pieces[1]), float(box * small.factor))
+
+
+def _both(peaks: Peaks, inverse_depth: tuple[Array, Array], height: int, parameters: LaserParameters) -> list["_Arm"]:
+    """Both arms; a peak that both claim goes to the piece that has more to say for itself."""
+    everything = np.arange(len(peaks.row))
+    found = [_arm(peaks, q, everything, height, parameters) for q in inverse_depth]
+    claim = np.zeros((2, len(peaks.row)))
+    for number, arm in enumerate(found):
+        for members, gain in zip(arm.members, arm.gains, strict=True):
+            claim[number, members] = gain
+    for number, q in enumerate(inverse_depth):
+        lost = (claim[number] > 0) & (claim[number] <= claim[1 - number] - number * 1e-9)
+        if lost.any():
+            found[number] = _arm(peaks, q, np.flatnonzero(~lost), height, parameters)
+    return found
 
 
 def evidence(image: NDArray[np.uint8], gamma: float) -> Floats:
@@ -247,31 +254,35 @@ def _sampled(nodes: Floats, at: Floats) -> Array:
 
 
 class _Arm(NamedTuple):
-    """Pieces of one arm, as indices of peaks sorted by row, and what speaks for them."""
+    """Pieces of one arm, as indices of peaks sorted by row, and what speaks for each, points of 900 rows."""
 
     members: list[Indices]
-    gain: float
+    gains: list[float]
 
 
-def _arm(peaks: Peaks, inverse_depth: Array, height: int, parameters: LaserParameters) -> _Arm:
-    """The best chain of pieces of line on one sheet."""
-    inside = (inverse_depth > 1 / parameters.range_max_m) & (inverse_depth < 1 / parameters.range_min_m)
-    own = np.flatnonzero(inside)
+def _arm(peaks: Peaks, inverse_depth: Array, usable: Indices, height: int, parameters: LaserParameters) -> _Arm:
+    """The best chain of pieces of line on one sheet, made of usable peaks."""
+    q = inverse_depth[usable]
+    own = usable[(q > 1 / parameters.range_max_m) & (q < 1 / parameters.range_min_m)]
     if len(own) < parameters.chain_min_points:
-        return _Arm([], 0.0)
-    row, q = peaks.row[own], inverse_depth[own]
-    chain = _linked(row, _in_columns(peaks.take(own), q))
+        return _Arm([], [])
+    place = np.zeros(len(inverse_depth))
+    place[own] = _in_columns(peaks.take(own), inverse_depth[own])
+    chain = _linked(peaks.row[own], place[own])
     length = np.bincount(chain)
     # of texture everywhere, the longest pieces
     enough = max(parameters.chain_min_points, int(np.sort(length)[-_PIECES:][0]))
     members = [own[m] for m in _groups(chain, length >= enough)]
     if not members:
-        return _Arm([], 0.0)
+        return _Arm([], [])
     typical = _typical_strength(peaks.strength, members)
+    ends = np.array([[*peaks.row[m[[0, -1]]], *_end_values(place[m])] for m in members])
     gain = np.array([np.minimum(peaks.strength[m] / typical, 1).sum() for m in members])
-    ends = np.array([[*peaks.row[m[[0, -1]]], *_end_values(inverse_depth[m])] for m in members])
-    path, total = _best_path(gain * 900 / height, ends, 900 / height)
-    return _Arm([members[k] for k in path], total)
+    # a piece of the other arm looks steep
+    steep = np.abs(ends[:, 3] - ends[:, 2]) / (ends[:, 1] - ends[:, 0])
+    gain *= np.maximum(1 - steep / _STEEP_PX, 0) * 900 / height
+    path = _best_path(gain, ends, 900 / height)
+    return _Arm([members[k] for k in path], [float(gain[k]) for k in path])
 
 
 def _in_columns(peaks: Peaks, inverse_depth: Array) -> Array:
@@ -344,22 +355,25 @@ def _end_values(value: Array) -> tuple[float, float]:
     return float(np.median(value[:5])), float(np.median(value[-5:]))
 
 
-def _best_path(gain: Array, ends: Array, scale: float) -> tuple[list[int], float]:
+def _best_path(gain: Array, ends: Array, scale: float) -> list[int]:
     """Pieces that follow each other down the image, most points for fewest jumps: dynamic programming.
 
     Parameters
     ----------
     gain : (M,) what speaks for each piece, points.
-    ends : (M, 4) first and last row, inverse depth there.
+    ends : (M, 4) first and last row; place on the sheet there, columns of the reduced image.
     scale : points to a row.
     """
     order = np.argsort(ends[:, 0], kind="stable")
-    gain, (top, bottom, q_top, q_bottom) = gain[order], ends[order].T
+    gain, (top, bottom, at_top, at_bottom) = gain[order], ends[order].T
     best, previous = gain.copy(), np.full(len(gain), -1)
     for k in range(1, len(gain)):
-        jump = np.abs(q_top[k] - q_bottom[:k]) / np.minimum(q_top[k], q_bottom[:k])
-        overlap = np.maximum(bottom[:k] - top[k] + 1, 0) * scale
-        total = best[:k] - _JUMP_POINTS * jump - overlap
+        jump = np.abs(at_top[k] - at_bottom[:k])
+        gap = top[k] - bottom[:k]
+        # what a bottom without steps may do in between costs nothing
+        sudden = np.maximum(jump - _NOISE_PX - _SLOPE_PX * np.maximum(gap, 1), 0)
+        cost = _JUMP_POINTS * jump / np.minimum(at_top[k], at_bottom[:k]) + _STEP_POINTS * np.minimum(sudden, 1)
+        total = best[:k] - cost - np.maximum(1 - gap, 0) * scale
         total[bottom[:k] >= bottom[k]] = -np.inf
         i = int(np.argmax(total))
         if total[i] > 0:
@@ -367,7 +381,7 @@ def _best_path(gain: Array, ends: Array, scale: float) -> tuple[list[int], float
     path = [int(np.argmax(best))]
     while previous[path[-1]] >= 0:
         path.append(int(previous[path[-1]]))
-    return [int(order[k]) for k in reversed(path)], float(best.max())
+    return [int(order[k]) for k in reversed(path)]
 
 
 def _piece(peaks: Peaks, members: Indices) -> Piece:
