@@ -22,7 +22,9 @@ Indices = NDArray[np.intp]
 
 _CLIPPED: Final = 250
 # Arms nearer than so many widths of the line are not told apart.
-_APART: Final = 4.5
+APART: Final = 4.5
+# How far from the line's rough place, in widths, it may be found.
+_ASTRAY: Final = 1.2
 _LEAST_SNR: Final = 4.0
 # Neighbours that scatter is measured by, rows; at least, and in widths.
 _LAG_ROWS, _LAG_WIDTHS = 4, 2.0
@@ -190,10 +192,12 @@ def _centred(image: NDArray[np.uint8], rows: _Rows, box_px: float, factor: int) 
     half = reach + wide
     level = _averaged(_strip(image, v, centre, half * columns + columns // 2)[0], columns)
     sigma = max(0.4 * box_px / columns, 0.8)
-    narrow = cv2.GaussianBlur(cv2.blur(level, (1, 5 if every == 1 else 3)), (2 * int(2.5 * sigma) + 1, 1), sigma)
+    narrow = cv2.GaussianBlur(cv2.blur(level, (1, 7 if every == 1 else 5)), (2 * int(2.5 * sigma) + 1, 1), sigma)
     broad = cv2.blur(narrow, (2 * wide + 1, 1))
     near = slice(wide, wide + 2 * reach + 1)
-    best = np.argmax(narrow[:, near] - broad[:, near], axis=1) - reach
+    best = np.argmax(narrow[:, near] - broad[:, near], axis=1)
+    # a stone outshines the line here and there
+    best = cv2.medianBlur(best.astype(np.uint8)[:, None], 9).ravel().astype(float) - reach
     off = centre + columns * best - rows.u[::every]
     return rows._replace(u=rows.u + np.interp(np.arange(len(rows.v)), np.arange(len(v)) * every, off))
 
@@ -262,9 +266,9 @@ def _lit_by_other(apart: Array, half: int, reach: float) -> NDArray[np.bool_]:
 
 def _accepted(fit: _Fit, rows: _Rows, columns: int) -> _Fit:
     """Columns set to NaN where nothing is sure to have been measured, or only half of it could be seen."""
-    bad = (fit.signal_to_noise < _LEAST_SNR) | (np.abs(fit.u - rows.u) > 2 * fit.width + 1)
+    bad = (fit.signal_to_noise < _LEAST_SNR) | (np.abs(fit.u - rows.u) > _ASTRAY * fit.width + 1)
     bad |= (fit.u < 0.7 * fit.width) | (fit.u > columns - 1 - 0.7 * fit.width)
-    bad |= np.abs(rows.other - fit.u) < _APART * fit.width
+    bad |= np.abs(rows.other - fit.u) < APART * fit.width
     return fit._replace(u=np.where(bad, np.nan, fit.u))
 
 

@@ -38,6 +38,8 @@ _STEEP_PX: Final = 1.5
 # Points, of 900 rows, that a jump costs: by the whole range; and any jump.
 _JUMP_POINTS: Final = 80.0
 _STEP_POINTS: Final = 6.0
+# What texture alone does not reach, points of 900 rows: in one piece, and in all pieces of an arm.
+_LONG_POINTS, _MANY_POINTS = 45.0, 160.0
 _PIECES: Final = 250
 
 
@@ -125,10 +127,15 @@ def search(small: Reduced, camera: Camera, light: Laser, parameters: LaserParame
     seen = evidence(small.image, parameters.gamma)
     box = _best_box(seen)
     peaks = _peaks(seen, box, small, parameters)
-    inverse_depth = inverse_depths(camera, light, small, peaks)
+    inverse_depth = inverse_depths(camera, light, peaks.u, peaks.v)
     found = _both(peaks, inverse_depth, len(seen), parameters)
-    pieces = [[_piece(peaks, m) for m in arm.members] for arm in found]
+    pieces = [[_piece(peaks, m) for m in arm.members] if _seen(arm) else [] for arm in found]
     return Arms((pieces[0], pieces[1]), float(box * small.factor))
+
+
+def _seen(arm: "_Arm") -> bool:
+    """Whether there is an arm: texture makes short pieces, and few that follow each other."""
+    return max(arm.gains, default=0.0) > _LONG_POINTS or sum(arm.gains) > _MANY_POINTS
 
 
 def _both(peaks: Peaks, inverse_depth: tuple[Array, Array], height: int, parameters: LaserParameters) -> list["_Arm"]:
@@ -223,19 +230,18 @@ def _local_scatter(scatter: Floats) -> Floats:
     return np.asarray(cv2.resize(sigma, scatter.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def inverse_depths(camera: Camera, light: Laser, small: Reduced, peaks: Peaks) -> tuple[Array, Array]:
-    """1/Z (N,) of each peak on either sheet, 1/m, interpolated between the nodes of a grid (to 0.1 px)."""
+def inverse_depths(camera: Camera, light: Laser, u: Array, v: Array) -> tuple[Array, Array]:
+    """1/Z (N,) of pixels (N,), (N,) on either sheet, 1/m, interpolated between the nodes of a grid (to 0.1 px)."""
     columns, rows = (max(2, -(-side // _GRID_PX) + 1) for side in (camera.width, camera.height))
-    v, u = np.mgrid[:rows, :columns].astype(float) * _GRID_PX
-    origin, direction = rays(camera, np.column_stack([u.ravel(), v.ravel()]))
-    at = np.stack([peaks.u, peaks.v]).astype(np.float32)[..., None] / np.float32(_GRID_PX)
+    nodes = np.mgrid[:rows, :columns].reshape(2, -1)[::-1].T * float(_GRID_PX)
+    origin, direction = rays(camera, nodes)
+    at = np.stack([u, v]).astype(np.float32)[..., None] / np.float32(_GRID_PX)
     found = []
     for sheet in light.sheets:
         normal = np.array(sheet.normal)
         toward, gap = direction @ normal, sheet.offset - origin @ normal
         grid = toward / (origin[:, 2] * toward + gap * direction[:, 2])
-        nodes = np.clip(grid, -100, 100).reshape(rows, columns).astype(np.float32)
-        found.append(_sampled(nodes, at))
+        found.append(_sampled(np.clip(grid, -100, 100).reshape(rows, columns).astype(np.float32), at))
     return found[0], found[1]
 
 

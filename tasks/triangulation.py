@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 # A Gaussian line of 100 grey levels is below one half at 3.3 sigma.
 _REACH_SIGMAS = 3.3
 _LEAST_NEAR = 8
+_BESIDE_PX = 20.0
 
 
 class Soundings(NamedTuple):
@@ -181,6 +182,7 @@ def _sound_sheets(
     line = line_profile.measure(image_bgr, arms, small.factor, parameters.gamma)
     if len(line.uv) < parameters.min_soundings:
         return nothing("no laser found")
+    line = line.take(_apart(camera, light, line))
     soundings = triangulate(camera, light, line.uv, line.arm, line.sigma_px)
     keep = reject_outliers(soundings, parameters)
     if keep.sum() < parameters.min_soundings:
@@ -192,6 +194,15 @@ def _sound_sheets(
     first = np.array([0.5 * (small.factor - 1), small.first_row])
     glow = laser.glow(small.image, (whole - first) / small.factor, reach / small.factor, 1) * small.factor + first
     return ImageSoundings(soundings, np.concatenate([whole, glow]), reach, "", agreement(soundings))
+
+
+def _apart(camera: Camera, light: Laser, line: line_profile.Line) -> NDArray[np.bool_]:
+    """Which points (N,) are clear of the crossing: on a level bottom the other arm is far from them in their row."""
+    u, v = line.uv.T
+    first, second = sheet_search.inverse_depths(camera, light, u, v)
+    beside = sheet_search.inverse_depths(camera, light, u + _BESIDE_PX, v)
+    per_px = 0.5 * (np.abs(beside[0] - first) + np.abs(beside[1] - second)) / _BESIDE_PX
+    return np.abs(first - second) > line_profile.APART * line.width_px * per_px
 
 
 def _no_cross(points: int, on_cross: int) -> str:
