@@ -39,12 +39,14 @@ class Fit(NamedTuple):
     sigma : its 1-sigma for the noise of pixels, pixels.
     width : standard deviation of the Gaussian, pixels.
     signal_to_noise : its height over that height's 1-sigma.
+    height : in the unit of the light.
     """
 
     place: Array
     sigma: Array
     width: Array
     signal_to_noise: Array
+    height: Array
 
 
 class _State(NamedTuple):
@@ -82,7 +84,7 @@ def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> F
     determinant = np.maximum(gg * dd - gd**2, _TINY)
     snr = state.height * np.sqrt(determinant / np.maximum(dd, _TINY)) / level
     sigma = level * np.sqrt(gg / determinant) / np.maximum(state.height, 1e-9)
-    return Fit(*(np.asarray(field, float).ravel() for field in (state.place, sigma, state.width, snr)))
+    return Fit(*(np.asarray(field, float).ravel() for field in (state.place, sigma, state.width, snr, state.height)))
 
 
 def ground(light: Floats, used: NDArray[np.bool_], width: float) -> Floats:

@@ -23,6 +23,9 @@ Indices = NDArray[np.intp]
 _CLIPPED: Final = 250
 # Arms nearer than so many widths of the line are not told apart.
 APART: Final = 4.5
+# A point less sure than this share of the width is none; nor is one so many times as bright as its neighbours.
+_VAGUE: Final = 0.5
+_BRIGHT: Final = 3.0
 # How far from the line's rough place, in widths, it may be found.
 _ASTRAY: Final = 1.2
 _LEAST_SNR: Final = 4.0
@@ -248,7 +251,15 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
     found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
-    return _accepted(_Fit(u, sigma, width, found.signal_to_noise), rows, image.shape[1])
+    fit = _Fit(u, sigma, width, found.signal_to_noise)
+    strange = found.height > _BRIGHT * _usual(found.height)
+    return _accepted(fit._replace(u=np.where(strange, np.nan, fit.u)), rows, image.shape[1])
+
+
+def _usual(height: Array) -> Array:
+    """Running median (N,) of heights, over 31 rows, to a sixteenth of a stop."""
+    steps = np.clip(16 * np.log2(np.maximum(height, 1e-6)) + 255, 0, 255).astype(np.uint8)
+    return 2 ** ((cv2.medianBlur(steps[:, None], 31).ravel().astype(float) - 255) / 16)
 
 
 def _all(pixels: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:
@@ -267,6 +278,7 @@ def _lit_by_other(apart: Array, half: int, reach: float) -> NDArray[np.bool_]:
 def _accepted(fit: _Fit, rows: _Rows, columns: int) -> _Fit:
     """Columns set to NaN where nothing is sure to have been measured, or only half of it could be seen."""
     bad = (fit.signal_to_noise < _LEAST_SNR) | (np.abs(fit.u - rows.u) > _ASTRAY * fit.width + 1)
+    bad |= fit.sigma > _VAGUE * fit.width
     bad |= (fit.u < 0.7 * fit.width) | (fit.u > columns - 1 - 0.7 * fit.width)
     bad |= np.abs(rows.other - fit.u) < APART * fit.width
     return fit._replace(u=np.where(bad, np.nan, fit.u))

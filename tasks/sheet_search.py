@@ -35,6 +35,9 @@ _REACH_ROWS: Final = 3
 _NOISE_PX: Final = 1.0
 _SLOPE_PX: Final = 0.6
 _STEEP_PX: Final = 1.5
+# A chain is cut where it climbs so much a row for so many points.
+_CLIFF_PX: Final = 1.25
+_CLIFF_POINTS: Final = 5
 # Points, of 900 rows, that a jump costs: by the whole range; and any jump.
 _JUMP_POINTS: Final = 80.0
 _STEP_POINTS: Final = 6.0
@@ -274,7 +277,7 @@ def _arm(peaks: Peaks, inverse_depth: Array, usable: Indices, height: int, param
         return _Arm([], [])
     place = np.zeros(len(inverse_depth))
     place[own] = _in_columns(peaks.take(own), inverse_depth[own])
-    chain = _linked(peaks.row[own], place[own])
+    chain = _without_cliffs(_linked(peaks.row[own], place[own]), peaks.row[own], place[own])
     length = np.bincount(chain)
     # of texture everywhere, the longest pieces
     enough = max(parameters.chain_min_points, int(np.sort(length)[-_PIECES:][0]))
@@ -328,6 +331,24 @@ def _linked(row: Indices, place: Array) -> NDArray[np.int32]:
     chain = np.empty(count, np.int32)
     chain[order] = connected_components(links, directed=False)[1]
     return chain
+
+
+def _without_cliffs(chain: NDArray, row: Indices, place: Array) -> NDArray:
+    """Chains (N,) cut where they turn off as steeply as the other arm does: there one runs on along the other.
+
+    Points of the steep stretch have chains of their own.
+    """
+    order = np.lexsort((row, chain))
+    ahead, behind = order[_CLIFF_POINTS:], order[:-_CLIFF_POINTS]
+    steep = np.abs(place[ahead] - place[behind]) > _CLIFF_PX * (row[ahead] - row[behind])
+    steep = np.flatnonzero(steep & (chain[ahead] == chain[behind]))
+    alone = np.zeros(len(row), bool)
+    for k in range(_CLIFF_POINTS + 1):
+        alone[steep + k] = True
+    change = (np.diff(chain[order]) != 0) | alone[1:] | alone[:-1]
+    cut = np.empty(len(row), np.intp)
+    cut[order] = np.concatenate([[0], np.cumsum(change)])
+    return cut
 
 
 def _nearest(wanted: Array, key: Array, reach: float) -> Indices:
