@@ -21,7 +21,8 @@ Noise = tuple[float, float, float]
 WINDOW: Final = 4.5
 GROUND: Final = 3.2
 FIT: Final = 3.0
-_STEPS: Final = 3
+# Where the crest is clipped, height and width are told by the flanks, and slowly.
+_STEPS, _STEPS_CLIPPED = 3, 7
 # Rows over which ground, width and noise are averaged.
 _GROUND_ROWS, _WIDTH_ROWS, _NOISE_ROWS = 9, 41, 31
 # Bands of height, of the usual line's, in which the noise is measured, in so many rows.
@@ -40,6 +41,7 @@ class Fit(NamedTuple):
     width : standard deviation of the Gaussian, pixels.
     signal_to_noise : its height over that height's 1-sigma.
     height : in the unit of the light.
+    misfit : scatter of the residuals squared, over that of the profiles around.
     """
 
     place: Array
@@ -47,6 +49,7 @@ class Fit(NamedTuple):
     width: Array
     signal_to_noise: Array
     height: Array
+    misfit: Array
 
 
 class _State(NamedTuple):
@@ -75,16 +78,17 @@ def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> F
     zero = np.zeros((len(light), 1), np.float32)
     state = _State(zero, zero + np.float32(width), zero, light, light, (zero, zero, zero))
     noise = (floor, 0.0, 0.0)
-    for k in range(_STEPS):
-        state = _improved(state, light, mask, x, noise, last=k == _STEPS - 1)
-        if k == _STEPS - 2:
+    steps = _STEPS if used[:, half].mean() > 0.9 else _STEPS_CLIPPED
+    for k in range(steps):
+        state = _improved(state, light, mask, x, noise, last=k == steps - 1)
+        if k == steps - 2:
             noise = _noise(state, mask, x, floor)
-    level = _noise_level(state, mask, x, noise)
+    level, misfit = _noise_level(state, mask, x, noise)
     gg, gd, dd = state.normals
     determinant = np.maximum(gg * dd - gd**2, _TINY)
     snr = state.height * np.sqrt(determinant / np.maximum(dd, _TINY)) / level
     sigma = level * np.sqrt(gg / determinant) / np.maximum(state.height, 1e-9)
-    return Fit(*(np.asarray(field, float).ravel() for field in (state.place, sigma, state.width, snr, state.height)))
+    return Fit(*(np.asarray(field, float).ravel() for field in (state.place, sigma, state.width, snr, state.height, misfit)))
 
 
 def ground(light: Floats, used: NDArray[np.bool_], width: float) -> Floats:
@@ -184,9 +188,10 @@ def _variance(height: Floats, gaussian: Floats, noise: Noise) -> Floats | float:
     return beside * (1 + on * (linear + square * on))
 
 
-def _noise_level(state: _State, mask: Floats, x: Floats, noise: Noise) -> Floats:
-    """Scatter of the residuals (N, 1) over what was expected, of some rows together."""
+def _noise_level(state: _State, mask: Floats, x: Floats, noise: Noise) -> tuple[Floats, Floats]:
+    """Scatter of the residuals (N, 1) over what was expected, of some rows together; its square in each row to that."""
     inside = mask * (np.abs(x - state.place) < WINDOW * state.width)
     squares = state.residual**2 / _variance(state.height, state.gaussian, noise)
     up, down = _dot(np.minimum(squares, 16), inside), np.maximum(_dot(inside, inside) - 2, 0.5)
-    return np.sqrt(np.clip(_along(up, _NOISE_ROWS) / _along(down, _NOISE_ROWS), 0.3, 30))
+    around = np.clip(_along(up, _NOISE_ROWS) / _along(down, _NOISE_ROWS), 0.3, 30)
+    return np.sqrt(around), up / down / around

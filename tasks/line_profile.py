@@ -26,6 +26,11 @@ APART: Final = 4.5
 # A point less sure than this share of the width is none; nor is one so many times as bright as its neighbours.
 _VAGUE: Final = 0.5
 _BRIGHT: Final = 3.0
+# Nor, if it stands out clearly, one with this share of the blue and red of white light.
+_WHITE: Final = 0.7
+_COLOUR_SNR: Final = 8.0
+# Nor one whose profile is so much less like a line than those around it.
+_MISFIT: Final = 3.0
 # How far from the line's rough place, in widths, it may be found.
 _ASTRAY: Final = 1.2
 _LEAST_SNR: Final = 4.0
@@ -252,8 +257,23 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
     fit = _Fit(u, sigma, width, found.signal_to_noise)
-    strange = found.height > _BRIGHT * _usual(found.height)
+    if image.ndim == 3:
+        fit = fit._replace(u=np.where(_white(image, rows.v, fit, linear), np.nan, u))
+    strange = (found.height > _BRIGHT * _usual(found.height)) | (found.misfit > _MISFIT)
     return _accepted(fit._replace(u=np.where(strange, np.nan, fit.u)), rows, image.shape[1])
+
+
+def _white(image: NDArray[np.uint8], v: Indices, fit: _Fit, linear: Floats) -> NDArray[np.bool_]:
+    """Which points (N,) add to blue and red what white light would: bubbles, shells. Clipped ones cannot be told."""
+    side = np.round(gaussian_fit.GROUND * fit.width)[:, None] * np.array([-1.0, 0.0, 1.0])
+    column = np.clip(np.round(fit.u)[:, None] + side, 0, image.shape[1] - 1).astype(np.intp)
+    level = image[v[:, None], column]
+    light = linear[level]
+    beside = 0.5 * (light[:, 0] + light[:, 2])
+    added = light[:, 1] - beside
+    expected = (beside[:, 0] + beside[:, 2]) * added[:, 1]
+    told = (fit.signal_to_noise > _COLOUR_SNR) & (level[:, 1, 1] < _CLIPPED) & (beside[:, 1] > 0.02)
+    return told & ((added[:, 0] + added[:, 2]) * beside[:, 1] > _WHITE * expected)
 
 
 def _usual(height: Array) -> Array:

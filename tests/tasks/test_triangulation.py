@@ -125,7 +125,9 @@ def test_reasons_are_given_where_there_are_no_soundings():
     image = cross_image(camera, 2.9, 60.0)
     elsewhere = PARAMETERS.model_copy(update={"range_min_m": 5.0, "range_max_m": 6.0})
     outside = tri.sound(image, camera, LIGHT, elsewhere)
-    assert outside.reason.startswith("no laser cross found")
-    assert len(outside.soundings.uv) == 0
+    assert outside.reason == "no laser found"
+    paper = tri.sound(image, camera, LIGHT, elsewhere.model_copy(update={"method": "paper"}))
+    assert paper.reason.startswith("no laser cross found")
+    assert len(paper.soundings.uv) == len(outside.soundings.uv) == 0
     demanding = PARAMETERS.model_copy(update={"min_soundings": 5000})
     assert tri.sound(image, camera, LIGHT, demanding).reason == "no laser found"
