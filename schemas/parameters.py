@@ -23,7 +23,8 @@ class LaserParameters(Model):
         float, Field(ge=1, le=3, description="sheets: the camera's, undone before measuring; level = light^(1/gamma)")
     ] = 2.2
     peak_sigmas: Annotated[
-        float, Field(ge=1, le=20, description="sheets: height of a line in the reduced image over the scatter around it")
+        float,
+        Field(ge=1, le=20, description="sheets: height of a line in the reduced image over the scatter around it"),
     ] = 3.0
     intensity_sigmas: Annotated[
         float, Field(ge=0.5, le=20, description="green threshold: standard deviations above the mean")

@@ -88,7 +88,9 @@ def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> F
     determinant = np.maximum(gg * dd - gd**2, _TINY)
     snr = state.height * np.sqrt(determinant / np.maximum(dd, _TINY)) / level
     sigma = level * np.sqrt(gg / determinant) / np.maximum(state.height, 1e-9)
-    return Fit(*(np.asarray(field, float).ravel() for field in (state.place, sigma, state.width, snr, state.height, misfit)))
+    return Fit(
+        *(np.asarray(field, float).ravel() for field in (state.place, sigma, state.width, snr, state.height, misfit))
+    )
 
 
 def ground(light: Floats, used: NDArray[np.bool_], width: float) -> Floats:

@@ -27,7 +27,7 @@ APART: Final = 4.5
 _VAGUE: Final = 0.5
 _BRIGHT: Final = 3.0
 # Nor, if it stands out clearly, one with this share of the blue and red of white light.
-_WHITE: Final = 0.7
+_WHITE: Final = 0.8
 _COLOUR_SNR: Final = 8.0
 # Nor one whose profile is so much less like a line than those around it.
 _MISFIT: Final = 3.0
@@ -258,7 +258,8 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
     fit = _Fit(u, sigma, width, found.signal_to_noise)
     if image.ndim == 3:
-        fit = fit._replace(u=np.where(_white(image, rows.v, fit, linear), np.nan, u))
+        white = _white(image, rows.v, fit, linear) & unclipped.all(axis=1)
+        fit = fit._replace(u=np.where(white, np.nan, u))
     strange = (found.height > _BRIGHT * _usual(found.height)) | (found.misfit > _MISFIT)
     return _accepted(fit._replace(u=np.where(strange, np.nan, fit.u)), rows, image.shape[1])
 
@@ -272,7 +273,7 @@ def _white(image: NDArray[np.uint8], v: Indices, fit: _Fit, linear: Floats) -> N
     beside = 0.5 * (light[:, 0] + light[:, 2])
     added = light[:, 1] - beside
     expected = (beside[:, 0] + beside[:, 2]) * added[:, 1]
-    told = (fit.signal_to_noise > _COLOUR_SNR) & (level[:, 1, 1] < _CLIPPED) & (beside[:, 1] > 0.02)
+    told = (fit.signal_to_noise > _COLOUR_SNR) & (beside[:, 1] > 0.02)
     return told & ((added[:, 0] + added[:, 2]) * beside[:, 1] > _WHITE * expected)
 
 

@@ -56,7 +56,7 @@ def test_recall_and_precision_of_faint_lines(snr: float, recall: float, precisio
 
 
 def test_a_saturated_line_is_measured_by_its_flanks():
-    made = scene(300, noise=0.012)
+    made = scene(150, noise=0.012)
     line = measured(made)
     assert (made.image[..., 1] == 255).sum() > 3 * made.camera.height
     error = errors(line, made)
