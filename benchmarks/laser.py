@@ -92,10 +92,8 @@ def precision(width_px: float, gamma: float, seeds: int = 4) -> None:
         right = np.abs(error) < 5 * expected + 0.5
         ratio = np.sqrt((error[right] ** 2).mean() / (expected[right] ** 2).mean())
         recall = 100 * min(right.sum() / visible, 1)
-        print(
-            f"{width_px} | {gamma} | {snr} | {ratio:.2f} | {z[right].std():.2f} | {recall:.1f} | {100 * right.mean():.2f}",
-            flush=True,
-        )
+        shares = f"{recall:.1f} | {100 * right.mean():.2f}"
+        print(f"{width_px} | {gamma} | {snr} | {ratio:.2f} | {z[right].std():.2f} | {shares}", flush=True)
 
 
 def main() -> None:

@@ -107,12 +107,12 @@ def ground(light: Floats, used: NDArray[np.bool_], width: float) -> Floats:
     return (left + (right - left) * ((x - place[0]) / (place[1] - place[0]))).astype(np.float32)
 
 
-def _dot(a: Floats, b: Floats) -> Floats:
+def _dot(a: NDArray, b: NDArray) -> Floats:
     """Sums (N, 1) over the rows of a * b."""
-    return np.einsum("ij,ij->i", a, b)[:, None]
+    return np.asarray(np.einsum("ij,ij->i", a, b), np.float32)[:, None]
 
 
-def _along(values: Floats, rows: int) -> Floats:
+def _along(values: NDArray, rows: int) -> Floats:
     """Means (N, 1) of so many neighbours."""
     smooth = cv2.blur(values.reshape(1, -1), (rows, 1), borderType=cv2.BORDER_REFLECT)
     return np.asarray(smooth, np.float32).reshape(-1, 1)
@@ -134,7 +134,8 @@ def _improved(state: _State, light: Floats, mask: Floats, x: Floats, noise: Nois
     if not last:
         width = _wider(width, residual, height, (t, g, wg, gg))
     place = state.place + np.clip(step, -state.width, state.width)
-    return _State(np.clip(place, x[0], x[-1]), width, height, residual, g, (gg, gd, dd))
+    place = np.asarray(np.clip(place, x[0], x[-1]), np.float32)
+    return _State(place, width, height, residual, g, (gg, gd, dd))
 
 
 def _wider(width: Floats, residual: Floats, height: Floats, shape: tuple[Floats, Floats, Floats, Floats]) -> Floats:
@@ -146,7 +147,7 @@ def _wider(width: Floats, residual: Floats, height: Floats, shape: tuple[Floats,
     alike = _dot(wgs, g) / np.maximum(gg, _TINY)
     up = height * (_dot(wgs, residual) - alike * _dot(wg, residual)) / width
     down = height**2 * (_dot(wgs, g * square) - alike * _dot(wgs, g)) / width**2
-    change = _along(up, _WIDTH_ROWS) / np.maximum(_along(down, _WIDTH_ROWS), 1e-9)
+    change = _along(up, _WIDTH_ROWS) / np.maximum(_along(down, _WIDTH_ROWS), np.float32(1e-9))
     return np.maximum(width + np.clip(change, -0.2 * width, 0.2 * width), 0.5)
 
 
@@ -181,7 +182,7 @@ def _share(height: Floats) -> Floats:
     return np.minimum(height / max(float(np.median(height)), 1e-9), 4)
 
 
-def _variance(height: Floats, gaussian: Floats, noise: Noise) -> Floats | float:
+def _variance(height: Floats, gaussian: Floats, noise: Noise) -> NDArray | np.float32:
     """Of each pixel (N, M)."""
     beside, linear, square = (np.float32(part) for part in noise)
     if linear == 0 and square == 0:
@@ -190,7 +191,7 @@ def _variance(height: Floats, gaussian: Floats, noise: Noise) -> Floats | float:
     return beside * (1 + on * (linear + square * on))
 
 
-def _noise_level(state: _State, mask: Floats, x: Floats, noise: Noise) -> tuple[Floats, Floats]:
+def _noise_level(state: _State, mask: Floats, x: Floats, noise: Noise) -> tuple[NDArray, NDArray]:
     """Scatter of the residuals (N, 1) over what was expected, of some rows together; its square in each row to that."""
     inside = mask * (np.abs(x - state.place) < WINDOW * state.width)
     squares = state.residual**2 / _variance(state.height, state.gaussian, noise)

@@ -27,8 +27,9 @@ APART: Final = 4.5
 _VAGUE: Final = 0.5
 _BRIGHT: Final = 3.0
 # Nor, if it stands out clearly, one with this share of the blue and red of white light.
-_WHITE: Final = 0.8
+_WHITE: Final = 0.7
 _COLOUR_SNR: Final = 8.0
+_COLOUR_ROWS: Final = 21
 # Nor one whose profile is so much less like a line than those around it.
 _MISFIT: Final = 3.0
 # How far from the line's rough place, in widths, it may be found.
@@ -58,7 +59,8 @@ class Line(NamedTuple):
 
     def take(self, keep: NDArray) -> "Line":
         """The points that a mask or an index array (N,) selects."""
-        return Line(*(field[keep] for field in self))
+        sigma_px, width_px, signal_to_noise = (field[keep] for field in self[2:])
+        return Line(self.uv[keep], self.arm[keep], sigma_px, width_px, signal_to_noise)
 
 
 class _Rows(NamedTuple):
@@ -113,7 +115,7 @@ def measure(image_bgr: NDArray[np.uint8], arms: Arms, factor: int, gamma: float)
 
 def _points(fit: _Fit, v: Indices, arm: int) -> Line:
     keep = np.flatnonzero(np.isfinite(fit.u))
-    uv = np.column_stack([fit.u, v])[keep]
+    uv = np.column_stack([fit.u, v]).astype(np.float64)[keep]
     return Line(uv, np.full(len(keep), arm, np.uint8), fit.sigma[keep], fit.width[keep], fit.signal_to_noise[keep])
 
 
@@ -258,7 +260,7 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
     fit = _Fit(u, sigma, width, found.signal_to_noise)
     if image.ndim == 3:
-        white = _white(image, rows.v, fit, linear) & unclipped.all(axis=1)
+        white = _white(image, rows.v, fit, linear) & unclipped[:, half - 1 : half + 2].all(axis=1)
         fit = fit._replace(u=np.where(white, np.nan, u))
     strange = (found.height > _BRIGHT * _usual(found.height)) | (found.misfit > _MISFIT)
     return _accepted(fit._replace(u=np.where(strange, np.nan, fit.u)), rows, image.shape[1])
@@ -272,9 +274,12 @@ def _white(image: NDArray[np.uint8], v: Indices, fit: _Fit, linear: Floats) -> N
     light = linear[level]
     beside = 0.5 * (light[:, 0] + light[:, 2])
     added = light[:, 1] - beside
-    expected = (beside[:, 0] + beside[:, 2]) * added[:, 1]
-    told = (fit.signal_to_noise > _COLOUR_SNR) & (beside[:, 1] > 0.02)
-    return told & ((added[:, 0] + added[:, 2]) * beside[:, 1] > _WHITE * expected)
+    around = cv2.blur(beside, (1, _COLOUR_ROWS), borderType=cv2.BORDER_REFLECT)
+    expected = (around[:, 0] + around[:, 2]) * added[:, 1]
+    told = (fit.signal_to_noise > _COLOUR_SNR) & (around[:, 1] > 0.02)
+    white = told & ((added[:, 0] + added[:, 2]) * around[:, 1] > _WHITE * expected)
+    # where most of the line is white the image has no colour
+    return white & (white.mean() < 0.5)
 
 
 def _usual(height: Array) -> Array:
@@ -318,7 +323,7 @@ def _scatter_over_sigma(line: Line) -> float:
     even = np.logical_and.reduce([v[at[k + 1]] - v[at[k]] == lag for k in range(4)])
     if even.sum() < 20:
         return 1.0
-    off = sum(w * u[part] for w, part in zip(weight, at, strict=True))
-    expected = sum(w**2 * variance[part] for w, part in zip(weight, at, strict=True))
+    off = np.sum([w * u[part] for w, part in zip(weight, at, strict=True)], axis=0)
+    expected = np.sum([w**2 * variance[part] for w, part in zip(weight, at, strict=True)], axis=0)
     # median of a squared normal variable: 0.4549 of its variance
     return float(np.clip(np.sqrt(np.median(off[even] ** 2 / expected[even]) / 0.4549), 0.7, 20))

@@ -82,7 +82,7 @@ class Peaks(NamedTuple):
 
     def take(self, keep: NDArray) -> "Peaks":
         """The peaks that a mask or an index array (N,) selects."""
-        return Peaks(*(field[keep] for field in self))
+        return Peaks(self.row[keep], self.u[keep], self.v[keep], self.strength[keep])
 
 
 class Piece(NamedTuple):
@@ -180,7 +180,7 @@ def evidence(image: NDArray[np.uint8], gamma: float) -> Floats:
         # the core of an overexposed line is white between green edges
         closed = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((1, image.shape[1] // 40 | 1), np.uint8))
         seen = np.where(clipped, closed, seen)
-    return seen
+    return np.asarray(seen, np.float32)
 
 
 def linear_light(gamma: float) -> Floats:

@@ -79,7 +79,7 @@ def bubbles(light: np.ndarray) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize(("disturb", "wrong"), [(torch, 0.001), (bubbles, 0.02)])
+@pytest.mark.parametrize(("disturb", "wrong"), [(torch, 0.001), (bubbles, 0.03)])
 def test_torch_and_bubbles(disturb, wrong: float):
     assert sounded(with_noise(disturb(bottom()))).reason == "no laser found"
     made = scene(25)
