@@ -174,13 +174,13 @@ def evidence(image: NDArray[np.uint8], gamma: float) -> Floats:
     scatter = (rough.T @ rough / len(rough)).astype(float)
     weight = np.linalg.solve(scatter + 1e-3 * scatter[1, 1] * np.eye(3), _LASER_BGR)
     weight /= weight @ _LASER_BGR
-    seen = np.asarray(cv2.transform(light, weight[None].astype(np.float32)), np.float32)
+    seen: Floats = np.asarray(cv2.transform(light, weight[None].astype(np.float32)), np.float32)
     clipped = light[..., 1] > _CLIPPED
     if clipped[::3].mean() > 1e-4:
         # the core of an overexposed line is white between green edges
         closed = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((1, image.shape[1] // 40 | 1), np.uint8))
-        seen = np.where(clipped, closed, seen)
-    return np.asarray(seen, np.float32)
+        np.copyto(seen, closed, where=clipped)
+    return seen
 
 
 def linear_light(gamma: float) -> Floats:
