@@ -276,7 +276,8 @@ def _white(image: NDArray[np.uint8], v: Indices, fit: _Fit, linear: Floats) -> N
     added = light[:, 1] - beside
     around = cv2.blur(beside, (1, _COLOUR_ROWS), borderType=cv2.BORDER_REFLECT)
     expected = (around[:, 0] + around[:, 2]) * added[:, 1]
-    told = (fit.signal_to_noise > _COLOUR_SNR) & (around[:, 1] > 0.02)
+    # without light of another source beside the line there is nothing to compare with
+    told = (fit.signal_to_noise > _COLOUR_SNR) & (around[:, 1] > np.maximum(0.02, 0.1 * added[:, 1]))
     white = told & ((added[:, 0] + added[:, 2]) * around[:, 1] > _WHITE * expected)
     # where most of the line is white the image has no colour
     return white & (white.mean() < 0.5)

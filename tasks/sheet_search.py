@@ -185,7 +185,7 @@ def evidence(image: NDArray[np.uint8], gamma: float) -> Floats:
 
 def linear_light(gamma: float) -> Floats:
     """Linear light (256,), 0..1, of the levels of an image."""
-    return (np.arange(256, dtype=np.float32) / 255) ** np.float32(gamma)
+    return ((np.arange(256) / 255) ** gamma).astype(np.float32)
 
 
 def _lobes(seen: Floats, box: int) -> tuple[Floats, Floats]:
