@@ -147,8 +147,9 @@ def _wider(width: Floats, residual: Floats, height: Floats, shape: tuple[Floats,
     alike = _dot(wgs, g) / np.maximum(gg, _TINY)
     up = height * (_dot(wgs, residual) - alike * _dot(wg, residual)) / width
     down = height**2 * (_dot(wgs, g * square) - alike * _dot(wgs, g)) / width**2
-    change = _along(up, _WIDTH_ROWS) / np.maximum(_along(down, _WIDTH_ROWS), np.float32(1e-9))
-    return np.maximum(width + np.clip(change, -0.2 * width, 0.2 * width), 0.5)
+    up, down = (_along(part, _WIDTH_ROWS).astype(np.float64) for part in (up, down))
+    change = np.clip(up / np.maximum(down, 1e-9), -0.2 * width, 0.2 * width)
+    return np.maximum(width + change.astype(np.float32), np.float32(0.5))
 
 
 def _noise(state: _State, mask: Floats, x: Floats, floor: float) -> Noise:

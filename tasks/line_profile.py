@@ -31,7 +31,7 @@ _WHITE: Final = 0.7
 _COLOUR_SNR: Final = 8.0
 _COLOUR_ROWS: Final = 21
 # Nor one whose profile is so much less like a line than those around it.
-_MISFIT: Final = 3.0
+_MISFIT: Final = 4.0
 # How far from the line's rough place, in widths, it may be found.
 _ASTRAY: Final = 1.2
 _LEAST_SNR: Final = 4.0
