@@ -78,7 +78,7 @@ def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> F
     zero = np.zeros((len(light), 1), np.float32)
     state = _State(zero, zero + np.float32(width), zero, light, light, (zero, zero, zero))
     noise = (floor, 0.0, 0.0)
-    steps = _STEPS if used[:, half].mean() > 0.9 else _STEPS_CLIPPED
+    steps = _STEPS if used[:, half].mean() > 0.5 else _STEPS_CLIPPED
     for k in range(steps):
         state = _improved(state, light, mask, x, noise, last=k == steps - 1)
         if k == steps - 2:
