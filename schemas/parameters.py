@@ -15,6 +15,17 @@ from .problems import inconsistent
 class LaserParameters(Model):
     """Laser point detection, segmentation and triangulation (paper III.B, III.C, III.D)."""
 
+    method: Annotated[
+        Literal["sheets", "paper"],
+        Field(description="sheets: the two arms at once as curves on their sheets of light; paper: III.B and III.C"),
+    ] = "sheets"
+    gamma: Annotated[
+        float, Field(ge=1, le=3, description="sheets: the camera's, undone before measuring; level = light^(1/gamma)")
+    ] = 2.2
+    peak_sigmas: Annotated[
+        float,
+        Field(ge=1, le=20, description="sheets: height of a line in the reduced image over the scatter around it"),
+    ] = 3.0
     intensity_sigmas: Annotated[
         float, Field(ge=0.5, le=20, description="green threshold: standard deviations above the mean")
     ] = 3.0

@@ -292,26 +292,33 @@ def _robust_plane(design: Array, inverse_depth: Array, plane: Array) -> Array:
 # ---------------------------------------------------------------------------------------------- whole line
 
 
-def whole_line(points: LaserPoints, cross: Cross, shape: tuple[int, int]) -> Array:
+def whole_line(uv: Array, arm: NDArray, step_px: int, shape: tuple[int, int]) -> Array:
     """Pixels (M, 2) along all light of the cross, no farther apart than the rows of detection.
 
-    All detected points, the straight joints over gaps of an arm (the crossing, dark stones, faint stretches) and its
-    last stretch to the border of the image, where the window of detection does not reach. Gaps wider than a tenth of
+    All points, the straight joints over gaps of an arm (the crossing, dark stones, faint stretches) and its last
+    stretch to the border of the image, where the window of detection does not reach. Gaps wider than a tenth of
     the image are left open: there the arm is hidden or displaced.
+
+    Parameters
+    ----------
+    uv : (N, 2) pixels of points on lines of light
+    arm : (N,) number of the sheet, negative where it is not known
+    step_px : distance between rows of points, pixels
+    shape : height and width of the image
     """
-    pieces = [points.uv]
+    pieces = [uv]
     widest = 0.1 * max(shape)
     for number in (0, 1):
-        uv = points.uv[cross.arm == number]
-        if len(uv) < 2:
+        own = uv[arm == number]
+        if len(own) < 2:
             continue
-        uv = uv[np.argsort(uv[:, 1], kind="stable")]
-        ends = [_to_border(uv[19::-1], shape), _to_border(uv[-20:], shape)]
-        uv = np.concatenate([ends[0], uv, ends[1]])
-        length = np.hypot(*np.diff(uv, axis=0).T)
-        for k in np.flatnonzero((length > 3 * points.step_px) & (length < widest)):
-            share = np.linspace(0, 1, int(np.ceil(length[k] / points.step_px)) + 1)[:, None]
-            pieces.append(uv[k] + share * (uv[k + 1] - uv[k]))
+        own = own[np.argsort(own[:, 1], kind="stable")]
+        ends = [_to_border(own[19::-1], shape), _to_border(own[-20:], shape)]
+        own = np.concatenate([ends[0], own, ends[1]])
+        length = np.hypot(*np.diff(own, axis=0).T)
+        for k in np.flatnonzero((length > 3 * step_px) & (length < widest)):
+            share = np.linspace(0, 1, int(np.ceil(length[k] / step_px)) + 1)[:, None]
+            pieces.append(own[k] + share * (own[k + 1] - own[k]))
     return np.concatenate(pieces)
 
 

@@ -7,13 +7,15 @@ from numpy.typing import NDArray
 
 from ..schemas.calibration import Camera, Laser, LaserPlane
 from ..schemas.parameters import LaserParameters
-from . import cross, laser
+from . import cross, laser, line_profile, sheet_search
 from .camera import normalised, project, rays
 
 Array = NDArray[np.float64]
 
 # A Gaussian line of 100 grey levels is below one half at 3.3 sigma.
 _REACH_SIGMAS = 3.3
+_LEAST_NEAR = 8
+_BESIDE_PX = 20.0
 
 
 class Soundings(NamedTuple):
@@ -69,12 +71,12 @@ def triangulate(camera: Camera, light: Laser, uv: Array, arm: NDArray, sigma_px:
     """
     uv = np.asarray(uv, float).reshape(-1, 2)
     X, sigma = np.full((len(uv), 3), np.nan), np.full(len(uv), np.nan)
-    half = np.array([0.5, 0.0])
+    tenth = np.array([0.1, 0.0])
     for number, sheet in enumerate(light.sheets):
         own = np.asarray(arm) == number
-        X[own] = intersect(camera, sheet, uv[own])[0]
-        change = intersect(camera, sheet, uv[own] + half)[1] - intersect(camera, sheet, uv[own] - half)[1]
-        sigma[own] = np.abs(change) * np.asarray(sigma_px)[own]
+        X[own], distance = intersect(camera, sheet, uv[own])
+        change = intersect(camera, sheet, uv[own] + tenth)[1] - distance
+        sigma[own] = 10 * np.abs(change) * np.asarray(sigma_px)[own]
     return Soundings(uv, np.asarray(arm).astype(np.uint8), X, sigma)
 
 
@@ -120,25 +122,41 @@ def reject_outliers(soundings: Soundings, parameters: LaserParameters) -> NDArra
     return keep
 
 
+class Agreement(NamedTuple):
+    """How well both sheets agree on the bottom where they meet: a check of the calibration.
+
+    Attributes
+    ----------
+    gap_m : how much deeper arm b has the bottom there than arm a, metres.
+    sigma_m : its 1-sigma, from the scatter of the soundings about their straight lines.
+    """
+
+    gap_m: float
+    sigma_m: float
+
+
 class ImageSoundings(NamedTuple):
     """What one image gives.
 
     Attributes
     ----------
     soundings : the accepted ones.
-    points : everything detected.
-    cross : its arms and centre.
     line_uv : (M, 2) pixels along the whole line of light, gaps closed: what laser.mask is to erase.
     halfwidth_px : how far the light reaches to each side of line_uv.
     reason : empty, or why there are no soundings.
+    agreement : of the two arms, or None where they are not both seen around their crossing.
     """
 
     soundings: Soundings
-    points: laser.LaserPoints
-    cross: cross.Cross
     line_uv: Array
     halfwidth_px: float
     reason: str
+    agreement: Agreement | None = None
+
+
+def nothing(reason: str) -> ImageSoundings:
+    """An image without soundings, and why."""
+    return ImageSoundings(no_soundings(), np.zeros((0, 2)), 0.0, reason)
 
 
 def sound(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters) -> ImageSoundings:
@@ -146,12 +164,57 @@ def sound(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters
 
     Parameters
     ----------
-    image_bgr : (H, W, 3) uint8 of the camera's size
+    image_bgr : (H, W, 3) or (H, W) uint8 of the camera's size
     """
+    height, width = image_bgr.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        return nothing(f"size {width}x{height}, calibration says {camera.width}x{camera.height}")
+    if parameters.method == "paper":
+        return _sound_paper(image_bgr, camera, light, parameters)
+    return _sound_sheets(image_bgr, camera, light, parameters)
+
+
+def _sound_sheets(
+    image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters
+) -> ImageSoundings:
+    small = sheet_search.reduce(image_bgr)
+    arms = sheet_search.search(small, camera, light, parameters)
+    line = line_profile.measure(image_bgr, arms, small.factor, parameters.gamma)
+    if len(line.uv) < parameters.min_soundings:
+        return nothing("no laser found")
+    line = line.take(_apart(camera, light, line))
+    soundings = triangulate(camera, light, line.uv, line.arm, line.sigma_px)
+    keep = reject_outliers(soundings, parameters)
+    if keep.sum() < parameters.min_soundings:
+        return nothing(_no_cross(len(keep), int(keep.sum())))
+    soundings = soundings.take(keep)
+    every = slice(None, None, small.factor)
+    whole = cross.whole_line(line.uv[every], line.arm[every], small.factor, image_bgr.shape[:2])
+    reach = _REACH_SIGMAS * float(np.median(line.width_px))
+    first = np.array([0.5 * (small.factor - 1), small.first_row])
+    glow = laser.glow(small.image, (whole - first) / small.factor, reach / small.factor, 1) * small.factor + first
+    return ImageSoundings(soundings, np.concatenate([whole, glow]), reach, "", agreement(soundings))
+
+
+def _apart(camera: Camera, light: Laser, line: line_profile.Line) -> NDArray[np.bool_]:
+    """Which points (N,) are clear of the crossing: on a level bottom the other arm is far from them in their row."""
+    u, v = line.uv.T
+    first, second = sheet_search.inverse_depths(camera, light, u, v)
+    beside = sheet_search.inverse_depths(camera, light, u + _BESIDE_PX, v)
+    per_px = 0.5 * (np.abs(beside[0] - first) + np.abs(beside[1] - second)) / _BESIDE_PX
+    return np.abs(first - second) > line_profile.APART * line.width_px * per_px
+
+
+def _no_cross(points: int, on_cross: int) -> str:
+    return f"no laser cross found: {points} points on lines of light, {on_cross} of them on the cross"
+
+
+def _sound_paper(
+    image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters
+) -> ImageSoundings:
     points = laser.detect(image_bgr, parameters)
-    nothing = ImageSoundings(no_soundings(), points, cross.nowhere(points), np.zeros((0, 2)), 0.0, "no laser found")
     if len(points.uv) < parameters.min_soundings:
-        return nothing
+        return nothing("no laser found")
     sheets = sheets_at(camera, light, points.uv, parameters)
     inverse_range = (1 / parameters.range_max_m, 1 / parameters.range_min_m)
     found = cross.segment(points, image_bgr.shape[:2], sheets, inverse_range)
@@ -159,9 +222,50 @@ def sound(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters
     soundings = triangulate(camera, light, points.uv[told], found.arm[told], points.sigma_px[told])
     keep = reject_outliers(soundings, parameters)
     if keep.sum() < parameters.min_soundings:
-        reason = f"no laser cross found: {len(points.uv)} points on lines of light, {keep.sum()} of them on the cross"
-        return nothing._replace(cross=found, reason=reason)
-    line = cross.whole_line(points, found, image_bgr.shape[:2])
+        return nothing(_no_cross(len(points.uv), int(keep.sum())))
+    line = cross.whole_line(points.uv, found.arm, points.step_px, image_bgr.shape[:2])
     reach = _REACH_SIGMAS * float(np.median(points.width_px))
     line = np.concatenate([line, laser.glow(image_bgr, line, reach, points.step_px)])
-    return ImageSoundings(soundings.take(keep), points, found, line, reach, "")
+    soundings = soundings.take(keep)
+    return ImageSoundings(soundings, line, reach, "", agreement(soundings))
+
+
+def agreement(soundings: Soundings) -> Agreement | None:
+    """Whether both arms have the same bottom where they meet.
+
+    Near the crossing (within a tenth of the range, half of it on either side) each arm's depth is a straight line in
+    its own direction; the two are compared where they cross in plan.
+    """
+    ends = []
+    where = _crossing(soundings)
+    if where is None:
+        return None
+    reach = 0.1 * float(np.median(soundings.X_camera[:, 2]))
+    for number in (0, 1):
+        X = soundings.X_camera[soundings.arm == number]
+        along = X[:, 1] - where
+        near = np.abs(along) < reach
+        if min((near & (along < 0)).sum(), (near & (along > 0)).sum()) < _LEAST_NEAR:
+            return None
+        ends.append(_value_at_zero(along[near], X[near, 2]))
+    return Agreement(ends[1][0] - ends[0][0], float(np.hypot(ends[0][1], ends[1][1])))
+
+
+def _crossing(soundings: Soundings) -> float | None:
+    """Camera y, metres, at which both arms have the same x, if they do."""
+    lines = [soundings.X_camera[soundings.arm == number] for number in (0, 1)]
+    if min(map(len, lines)) < 2 * _LEAST_NEAR:
+        return None
+    lines = [X[np.argsort(X[:, 1])] for X in lines]
+    y = np.linspace(max(X[0, 1] for X in lines), min(X[-1, 1] for X in lines), 400)
+    apart = np.interp(y, lines[0][:, 1], lines[0][:, 0]) - np.interp(y, lines[1][:, 1], lines[1][:, 0])
+    change = np.flatnonzero(np.sign(apart[1:]) != np.sign(apart[:-1]))
+    return float(y[change[len(change) // 2]]) if len(change) and y[-1] > y[0] else None
+
+
+def _value_at_zero(along: Array, depth: Array) -> tuple[float, float]:
+    """Depth at 0 of the straight line through points (N,), and its 1-sigma."""
+    design = np.column_stack([np.ones(len(along)), along])
+    value, *_ = np.linalg.lstsq(design, depth, rcond=None)
+    scatter = (depth - design @ value).std()
+    return float(value[0]), float(scatter * np.sqrt(np.linalg.inv(design.T @ design)[0, 0]))

@@ -78,11 +78,11 @@ def read_verified(job: Job, path: str, sha256: str, reduce: int = 1) -> np.ndarr
 def _measure(job: Job, role: Role, light: Laser | None, bgr: np.ndarray) -> Made:
     arrays, reason = {}, ""
     erase = np.zeros(bgr.shape[:2], bool)
-    count, range_m, sigma_m, halfwidth_px = 0, None, None, 0.0
+    count, range_m, sigma_m, halfwidth_px, agreement = 0, None, None, 0.0, None
     if light is not None:
         found = triangulation.sound(bgr, job.calibration.camera, light, job.parameters.laser)
         soundings, reason, halfwidth_px = found.soundings, found.reason, float(found.halfwidth_px)
-        count = len(soundings.uv)
+        count, agreement = len(soundings.uv), found.agreement
         if count:
             range_m, sigma_m = float(np.median(soundings.X_camera[:, 2])), float(np.median(soundings.sigma_m))
         erase = laser.mask(bgr.shape[:2], found.line_uv, found.halfwidth_px)
@@ -110,6 +110,8 @@ def _measure(job: Job, role: Role, light: Laser | None, bgr: np.ndarray) -> Made
         "range_m": range_m,
         "sigma_m": sigma_m,
         "halfwidth_px": halfwidth_px,
+        "laser_gap_m": agreement.gap_m if agreement else None,
+        "laser_gap_sigma_m": agreement.sigma_m if agreement else None,
         "features": feature_count,
     }
     return Made(arrays, info)

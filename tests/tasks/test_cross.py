@@ -154,7 +154,7 @@ def test_whole_line_has_no_gaps_but_the_wide_ones():
     v = points.uv[:, 1]
     narrow, wide = np.abs(v - 200) < 25, np.abs(v - 700) < 120
     kept = points.take(~narrow & ~wide)
-    line = cross.whole_line(kept, segmented(kept), SHAPE)
+    line = cross.whole_line(kept.uv, segmented(kept).arm, kept.step_px, SHAPE)
 
     def nearest(uv: np.ndarray) -> float:
         return float(np.hypot(*(line - uv).T).min())

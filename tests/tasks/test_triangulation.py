@@ -125,7 +125,43 @@ def test_reasons_are_given_where_there_are_no_soundings():
     image = cross_image(camera, 2.9, 60.0)
     elsewhere = PARAMETERS.model_copy(update={"range_min_m": 5.0, "range_max_m": 6.0})
     outside = tri.sound(image, camera, LIGHT, elsewhere)
-    assert outside.reason.startswith("no laser cross found")
-    assert len(outside.soundings.uv) == 0
+    assert outside.reason == "no laser found"
+    paper = tri.sound(image, camera, LIGHT, elsewhere.model_copy(update={"method": "paper"}))
+    assert paper.reason.startswith("no laser cross found")
+    assert len(paper.soundings.uv) == len(outside.soundings.uv) == 0
     demanding = PARAMETERS.model_copy(update={"min_soundings": 5000})
     assert tri.sound(image, camera, LIGHT, demanding).reason == "no laser found"
+
+
+@pytest.mark.parametrize("turned_mm", [0.0, 15.0])
+def test_arms_agree_unless_the_calibration_is_wrong(turned_mm: float):
+    camera = CAMERAS["brown"]
+    image = cross_image(camera, 2.9, 60.0)
+    first, second = LIGHT.sheets
+    wrong = second.model_copy(update={"offset": second.offset + turned_mm / 1000})
+    found = tri.sound(image, camera, LIGHT.model_copy(update={"planes": (first, wrong)}), PARAMETERS)
+    assert found.agreement is not None
+    gap, sigma = found.agreement
+    # depth changes by offset over the normal's share along a vertical ray through the crossing
+    expected = turned_mm / 1000 / abs(second.normal[2])
+    assert 0 < sigma < 0.5e-3
+    assert abs(abs(gap) - expected) < 5 * sigma + 0.7 * expected
+    assert abs(gap) > 0.3 * expected
+    one = found.soundings.take(found.soundings.arm == 0)
+    assert tri.agreement(one) is None
+    assert tri.agreement(tri.no_soundings()) is None
+
+
+def test_parameters_of_the_sheets_method_matter():
+    camera = CAMERAS["brown"]
+    image = cross_image(camera, 2.9, 110.0, noise=25.0)
+
+    def sounded(**change) -> tri.ImageSoundings:
+        return tri.sound(image, camera, LIGHT, PARAMETERS.model_copy(update=change))
+
+    usual = sounded().soundings
+    assert len(usual.uv) > 1000
+    assert len(sounded(peak_sigmas=20.0).soundings.uv) < 0.5 * len(usual.uv)
+    assert not np.array_equal(sounded(gamma=1.0).soundings.uv, usual.uv)
+    assert not np.array_equal(sounded(method="paper").soundings.uv, usual.uv)
+    assert len(sounded(chain_min_points=1000).soundings.uv) == 0

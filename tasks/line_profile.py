@@ -1,0 +1,331 @@
+"""Where a line of light is in each row, to the bound that the pixels' noise sets.
+
+Around a roughly known line each row's profile, in linear light, is fitted by a Gaussian on a sloping ground: least
+squares with each pixel's weight from its noise, which is the maximum likelihood. Clipped pixels, those outside the
+image and those that the other arm lights have no weight. Rows are measured one by one, so that steps stay sharp;
+only what changes slowly along the line (ground, width, noise) is shared between neighbours.
+"""
+
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+
+from . import gaussian_fit
+from .sheet_search import Arms, Piece, linear_light
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Indices = NDArray[np.intp]
+
+_CLIPPED: Final = 250
+# Arms nearer than so many widths of the line are not told apart.
+APART: Final = 4.5
+# A point less sure than this share of the width is none; nor is one so many times as bright as its neighbours.
+_VAGUE: Final = 0.5
+_BRIGHT: Final = 3.0
+# Nor, if it stands out clearly, one with this share of the blue and red of white light.
+_WHITE: Final = 0.7
+_COLOUR_SNR: Final = 8.0
+_COLOUR_ROWS: Final = 21
+# Nor one whose profile is so much less like a line than those around it.
+_MISFIT: Final = 4.0
+# How far from the line's rough place, in widths, it may be found.
+_ASTRAY: Final = 1.2
+_LEAST_SNR: Final = 4.0
+# Neighbours that scatter is measured by, rows; at least, and in widths.
+_LAG_ROWS, _LAG_WIDTHS = 4, 2.0
+
+
+class Line(NamedTuple):
+    """Points of both arms, by arm, then piece, then row.
+
+    Attributes
+    ----------
+    uv : (N, 2) pixels; v is a whole row.
+    arm : (N,) uint8, index of the sheet.
+    sigma_px : (N,) 1-sigma of u, pixels.
+    width_px : (N,) standard deviation of the line's profile along the row, pixels.
+    signal_to_noise : (N,) height of the line over that height's 1-sigma.
+    """
+
+    uv: Array
+    arm: NDArray[np.uint8]
+    sigma_px: Array
+    width_px: Array
+    signal_to_noise: Array
+
+    def take(self, keep: NDArray) -> "Line":
+        """The points that a mask or an index array (N,) selects."""
+        sigma_px, width_px, signal_to_noise = (field[keep] for field in self[2:])
+        return Line(self.uv[keep], self.arm[keep], sigma_px, width_px, signal_to_noise)
+
+
+class _Rows(NamedTuple):
+    """Rows to measure, one entry each: row, rough column, column of the other arm there (NaN: none)."""
+
+    v: Indices
+    u: Array
+    other: Array
+
+
+class _Fit(NamedTuple):
+    """Result for each row: column, its sigma for noise alone, width and signal to noise; NaN where it failed."""
+
+    u: Array
+    sigma: Array
+    width: Array
+    signal_to_noise: Array
+
+
+def no_line() -> Line:
+    """Nothing measured."""
+    none = np.zeros(0)
+    return Line(np.zeros((0, 2)), np.zeros(0, np.uint8), none, none, none)
+
+
+def measure(image_bgr: NDArray[np.uint8], arms: Arms, factor: int, gamma: float) -> Line:
+    """Sub-pixel points of the arms that were found.
+
+    Parameters
+    ----------
+    image_bgr : (H, W, 3) or (H, W), the full image.
+    arms : where to look.
+    factor : pixels of the full image to one of the reduced image in which the arms were found.
+    gamma : the camera's.
+    """
+    image = np.ascontiguousarray(image_bgr)
+    rows = [
+        _centred(image, _rows_of(pieces, factor, arms.box_px, image.shape), arms.box_px, factor)
+        for pieces in arms.pieces
+    ]
+    found = []
+    for arm, (own, other) in enumerate([(rows[0], rows[1]), (rows[1], rows[0])]):
+        if len(own.v) < _LAG_ROWS:
+            continue
+        beside = own._replace(other=_column_at(other, own.v))
+        found.append(_points(_fit(image, beside, arms.box_px, linear_light(gamma)), own.v, arm))
+    if not found:
+        return no_line()
+    line = Line(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return line._replace(sigma_px=line.sigma_px * _scatter_over_sigma(line))
+
+
+def _points(fit: _Fit, v: Indices, arm: int) -> Line:
+    keep = np.flatnonzero(np.isfinite(fit.u))
+    uv = np.column_stack([fit.u, v]).astype(np.float64)[keep]
+    return Line(uv, np.full(len(keep), arm, np.uint8), fit.sigma[keep], fit.width[keep], fit.signal_to_noise[keep])
+
+
+# -------------------------------------------------------------------------------------------- where to look
+
+
+def _rows_of(pieces: list[Piece], factor: int, box_px: float, shape: tuple[int, ...]) -> _Rows:
+    """Every row of the pieces and a little beyond their ends, half way to the next piece at most."""
+    found_v, found_u = [np.zeros(0, np.intp)], [np.zeros(0)]
+    edges = [(piece.v[0], piece.v[-1]) for piece in pieces]
+    for k, piece in enumerate(pieces):
+        up = _beyond(piece.u[0], _slope(piece.u, piece.v, 0), factor, box_px, shape[1])
+        down = _beyond(piece.u[-1], -_slope(piece.u, piece.v, -1), factor, box_px, shape[1])
+        if k:
+            up = min(up, max(0.5 * (edges[k][0] - edges[k - 1][1]), 0))
+        if k + 1 < len(pieces):
+            down = min(down, max(0.5 * (edges[k + 1][0] - edges[k][1]) - 0.5, 0))
+        first, last = max(0, int(np.ceil(piece.v[0] - up))), min(shape[0] - 1, int(np.floor(piece.v[-1] + down)))
+        v = np.arange(first, last + 1)
+        u = np.interp(v, piece.v, piece.u)
+        u += np.minimum(v - piece.v[0], 0) * _slope(piece.u, piece.v, 0)
+        u += np.maximum(v - piece.v[-1], 0) * _slope(piece.u, piece.v, -1)
+        inside = (u > -0.5) & (u < shape[1] - 0.5)
+        found_v.append(v[inside])
+        found_u.append(u[inside])
+    u = np.concatenate(found_u)
+    return _Rows(np.concatenate(found_v), u, np.full(len(u), np.nan))
+
+
+def _slope(u: Array, v: Array, end: int) -> float:
+    """Columns a row at one end (0 or -1) of a piece."""
+    part = slice(0, 9) if end == 0 else slice(-9, None)
+    u, v = u[part], v[part]
+    return float((u[-1] - u[0]) / (v[-1] - v[0]))
+
+
+def _beyond(u: float, outward: float, factor: int, box_px: float, width: int) -> float:
+    """Rows to look beyond an end: two of the reduced image, and to the border of the image where that is near.
+
+    Parameters
+    ----------
+    outward : columns a row, negative where the line comes nearer to u = 0 with each row outward times -1.
+    """
+    border = u if -outward < 0 else width - u
+    return max(2.0 * factor, 3 * box_px if border < 3 * box_px else 0.0)
+
+
+def _column_at(rows: _Rows, v: Indices) -> Array:
+    """Column (N,) of an arm in given rows, NaN above and below it."""
+    if not len(rows.v):
+        return np.full(len(v), np.nan)
+    order = np.argsort(rows.v, kind="stable")
+    return np.interp(v, rows.v[order], rows.u[order], left=np.nan, right=np.nan)
+
+
+def _strip(
+    image: NDArray[np.uint8], v: Indices, centre: Indices, half: int
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Green levels (N, 2 half + 1) around a column in each row, and which of them are in the image.
+
+    Those that are not repeat the row's last pixel.
+    """
+    width, size = image.shape[1], 2 * half + 1
+    green = image[..., 1] if image.ndim == 3 else image
+    step = green.strides[1]
+    # windows of consecutive pixels, of any start: the rows of an image lie one behind the other
+    windows = as_strided(green, (green.size - size + 1, size), (step, step), writeable=False)
+    level = windows[np.clip(v * width + centre - half, 0, len(windows) - 1)]
+    inside = np.ones(level.shape, bool)
+    cut = np.flatnonzero((centre < half) | (centre >= width - half))
+    column = centre[cut, None] + np.arange(-half, half + 1)
+    inside[cut] = (column >= 0) & (column < width)
+    level[cut] = green[v[cut, None], np.clip(column, 0, width - 1)]
+    return level, inside
+
+
+def _centred(image: NDArray[np.uint8], rows: _Rows, box_px: float, factor: int) -> _Rows:
+    """Rough columns improved at full resolution: the strongest peak near them, of some rows together."""
+    if not len(rows.v):
+        return rows
+    every, columns = max(1, factor // 2), 1 + 2 * int(box_px / 8)
+    reach, wide = factor // columns + 1, int(np.ceil(1.5 * box_px / columns)) + 1
+    v, centre = rows.v[::every], np.round(rows.u[::every]).astype(np.intp)
+    half = reach + wide
+    level = _averaged(_strip(image, v, centre, half * columns + columns // 2)[0], columns)
+    sigma = max(0.4 * box_px / columns, 0.8)
+    narrow = cv2.GaussianBlur(cv2.blur(level, (1, 7 if every == 1 else 5)), (2 * int(2.5 * sigma) + 1, 1), sigma)
+    broad = cv2.blur(narrow, (2 * wide + 1, 1))
+    near = slice(wide, wide + 2 * reach + 1)
+    best = np.argmax(narrow[:, near] - broad[:, near], axis=1)
+    # a stone outshines the line here and there
+    best = cv2.medianBlur(best.astype(np.uint8)[:, None], 9).ravel().astype(float) - reach
+    off = centre + columns * best - rows.u[::every]
+    return rows._replace(u=rows.u + np.interp(np.arange(len(rows.v)), np.arange(len(v)) * every, off))
+
+
+def _averaged(values: NDArray, columns: int) -> Floats:
+    """Means (N, M) of so many columns of (N, columns M)."""
+    values = values.astype(np.float32, copy=False)
+    if columns == 1:
+        return values
+    size = (values.shape[1] // columns, len(values))
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+# -------------------------------------------------------------------------------------------- profiles
+
+
+def _typical_width(image: NDArray[np.uint8], v: Indices, centre: Indices, box_px: float, linear: Floats) -> float:
+    """Standard deviation in pixels of the median profile of rows in which the line's column is known to a pixel."""
+    half, some = int(np.ceil(1.7 * box_px)) + 2, slice(None, None, max(1, len(v) // 300))
+    light = linear[_strip(image, v[some], centre[some], half)[0]]
+    ends = max(1, half // 4)
+    ground = 0.5 * (light[:, :ends].mean(axis=1) + light[:, -ends:].mean(axis=1))
+    profile = np.median(light - ground[:, None], axis=0).astype(float)
+    x = np.arange(-half, half + 1)
+    sigma = half / 3
+    for _ in range(12):
+        wide = 1.5 * sigma
+        weight = np.maximum(profile, 0) * np.exp(-0.5 * (x / wide) ** 2)
+        spread = float((weight * x**2).sum() / max(weight.sum(), 1e-12))
+        # the weight narrows a Gaussian profile: 1/spread = 1/sigma^2 + 1/wide^2
+        sigma = np.sqrt(1 / max(1 / max(spread, 0.05) - 1 / wide**2, (1.5 / half) ** 2))
+    return float(np.clip(sigma, 0.6, half / 1.5))
+
+
+def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -> _Fit:
+    """Gaussians of all rows of an arm."""
+    centre = np.round(rows.u).astype(np.intp)
+    width = _typical_width(image, rows.v, centre, box_px, linear)
+    # columns of a wide line are averaged: nothing is lost as long as they are narrower than the line
+    columns = 1 + 2 * int(width / 4)
+    half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
+    level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
+    light = _averaged(np.asarray(cv2.LUT(level, linear), np.float32), columns)
+    used, unclipped = _all(inside, columns), _all(level < _CLIPPED, columns)
+    used &= ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns)
+    light -= gaussian_fit.ground(light, used, width / columns)
+    typical = int(np.median(level[::7, ::3]))
+    floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
+    found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
+    u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
+    fit = _Fit(u, sigma, width, found.signal_to_noise)
+    if image.ndim == 3:
+        white = _white(image, rows.v, fit, linear) & unclipped[:, half - 1 : half + 2].all(axis=1)
+        fit = fit._replace(u=np.where(white, np.nan, u))
+    strange = (found.height > _BRIGHT * _usual(found.height)) | (found.misfit > _MISFIT)
+    return _accepted(fit._replace(u=np.where(strange, np.nan, fit.u)), rows, image.shape[1])
+
+
+def _white(image: NDArray[np.uint8], v: Indices, fit: _Fit, linear: Floats) -> NDArray[np.bool_]:
+    """Which points (N,) add to blue and red what white light would: bubbles, shells. Clipped ones cannot be told."""
+    side = np.round(gaussian_fit.GROUND * fit.width)[:, None] * np.array([-1.0, 0.0, 1.0])
+    column = np.clip(np.round(fit.u)[:, None] + side, 0, image.shape[1] - 1).astype(np.intp)
+    level = image[v[:, None], column]
+    light = linear[level]
+    beside = 0.5 * (light[:, 0] + light[:, 2])
+    added = light[:, 1] - beside
+    around = cv2.blur(beside, (1, _COLOUR_ROWS), borderType=cv2.BORDER_REFLECT)
+    expected = (around[:, 0] + around[:, 2]) * added[:, 1]
+    # without light of another source beside the line there is nothing to compare with
+    told = (fit.signal_to_noise > _COLOUR_SNR) & (around[:, 1] > np.maximum(0.02, 0.1 * added[:, 1]))
+    white = told & ((added[:, 0] + added[:, 2]) * around[:, 1] > _WHITE * expected)
+    # where most of the line is white the image has no colour
+    return white & (white.mean() < 0.5)
+
+
+def _usual(height: Array) -> Array:
+    """Running median (N,) of heights, over 33 rows, to a sixteenth of a stop."""
+    steps = np.clip(16 * np.log2(np.maximum(height, 1e-6)) + 255, 0, 255).astype(np.uint8)
+    usual = np.repeat(cv2.medianBlur(steps[::4, None], 9).ravel(), 4)[: len(height)]
+    return 2 ** ((usual.astype(float) - 255) / 16)
+
+
+def _all(pixels: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:
+    """Which groups (N, M) of columns of (N, columns M) are true in every column."""
+    return np.logical_and.reduce([pixels[:, k::columns] for k in range(columns)])
+
+
+def _lit_by_other(apart: Array, half: int, reach: float) -> NDArray[np.bool_]:
+    """Pixels (N, 2 half + 1) on which the other arm, so far from the middle (N,), shines."""
+    lit = np.zeros((len(apart), 2 * half + 1), bool)
+    near = np.flatnonzero(np.abs(apart) < half + reach)
+    lit[near] = np.abs(np.arange(-half, half + 1) - apart[near, None]) < reach
+    return lit
+
+
+def _accepted(fit: _Fit, rows: _Rows, columns: int) -> _Fit:
+    """Columns set to NaN where nothing is sure to have been measured, or only half of it could be seen."""
+    bad = (fit.signal_to_noise < _LEAST_SNR) | (np.abs(fit.u - rows.u) > _ASTRAY * fit.width + 1)
+    bad |= fit.sigma > _VAGUE * fit.width
+    bad |= (fit.u < 0.7 * fit.width) | (fit.u > columns - 1 - 0.7 * fit.width)
+    bad |= np.abs(rows.other - fit.u) < APART * fit.width
+    return fit._replace(u=np.where(bad, np.nan, fit.u))
+
+
+def _scatter_over_sigma(line: Line) -> float:
+    """By how much points scatter about their neighbours on the line, over their sigmas: speckle is not in these."""
+    u, v, variance = line.uv[:, 0], line.uv[:, 1], line.sigma_px**2
+    # farther apart than speckle and stones reach
+    lag = max(_LAG_ROWS, round(_LAG_WIDTHS * float(np.median(line.width_px)))) if len(u) else _LAG_ROWS
+    if len(u) <= 4 * lag + 20:
+        return 1.0
+    # a fourth difference: curved bottom is no scatter
+    at = [slice(k * lag, len(u) - (4 - k) * lag) for k in range(5)]
+    weight = (1 / 6, -4 / 6, 1.0, -4 / 6, 1 / 6)
+    even = np.logical_and.reduce([v[at[k + 1]] - v[at[k]] == lag for k in range(4)])
+    if even.sum() < 20:
+        return 1.0
+    off = np.sum([w * u[part] for w, part in zip(weight, at, strict=True)], axis=0)
+    expected = np.sum([w**2 * variance[part] for w, part in zip(weight, at, strict=True)], axis=0)
+    # median of a squared normal variable: 0.4549 of its variance
+    return float(np.clip(np.sqrt(np.median(off[even] ** 2 / expected[even]) / 0.4549), 0.7, 20))

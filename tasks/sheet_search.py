@@ -1,0 +1,418 @@
+"""The two arms of the laser cross in an image, roughly: one curve on each known sheet of light.
+
+The image is reduced (rows are sampled, columns averaged) and its channels weighed so that what stands out is the
+laser's colour, not the bottom's. Peaks along the rows are then linked on each sheet by itself: in inverse depth on
+its own sheet a line follows the bottom, on the other sheet it would be a cliff, so that pieces of line tell their
+arm. The best chain of pieces is found by dynamic programming: points speak for a piece, jumps in depth against it.
+"""
+
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ..schemas.calibration import Camera, Laser
+from ..schemas.parameters import LaserParameters
+from .camera import rays
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Indices = NDArray[np.intp]
+
+_WIDTH_PX: Final = 600
+_SMALLEST_PX: Final = 100
+# What the laser adds to blue, green and red, of linear light; filters are never as narrow as that of the laser.
+_LASER_BGR: Final = np.array([0.2, 1.0, 0.15])
+# Widths of the box that sums up the line, pixels of the reduced image.
+_BOXES: Final = (1, 3, 5, 9, 15)
+_CLIPPED: Final = 0.97
+_GRID_PX: Final = 48
+# Neighbours on a chain: so many rows apart at most, and so many pixels for the noise and for each row.
+_REACH_ROWS: Final = 3
+_NOISE_PX: Final = 1.0
+_SLOPE_PX: Final = 0.6
+_STEEP_PX: Final = 1.5
+# A chain is cut where it climbs so much a row for so many points.
+_CLIFF_PX: Final = 1.25
+_CLIFF_POINTS: Final = 5
+# Points, of 900 rows, that a jump costs: by the whole range; and any jump.
+_JUMP_POINTS: Final = 80.0
+_STEP_POINTS: Final = 6.0
+# What texture alone does not reach, points of 900 rows: in one piece, and in all pieces of an arm.
+_LONG_POINTS, _MANY_POINTS = 45.0, 160.0
+_PIECES: Final = 250
+
+
+class Reduced(NamedTuple):
+    """An image made small: rows sampled, columns averaged.
+
+    Attributes
+    ----------
+    image : (h, w, 3) or (h, w), uint8.
+    factor : pixels of the full image to one of this.
+    first_row : row of the full image that row 0 is.
+    """
+
+    image: NDArray[np.uint8]
+    factor: int
+    first_row: int
+
+    def full(self, rows: NDArray, columns: NDArray) -> tuple[Array, Array]:
+        """Columns u and rows v of the full image."""
+        return columns * self.factor + 0.5 * (self.factor - 1), rows * self.factor + float(self.first_row)
+
+
+class Peaks(NamedTuple):
+    """Places where a row of the reduced image crosses something like a line, sorted by row.
+
+    Attributes
+    ----------
+    row : (N,) rows of the reduced image.
+    u, v : (N,) pixels of the full image.
+    strength : (N,) height of the line over the scatter of heights around it.
+    """
+
+    row: Indices
+    u: Array
+    v: Array
+    strength: Array
+
+    def take(self, keep: NDArray) -> "Peaks":
+        """The peaks that a mask or an index array (N,) selects."""
+        return Peaks(self.row[keep], self.u[keep], self.v[keep], self.strength[keep])
+
+
+class Piece(NamedTuple):
+    """An unbroken piece of an arm: its pixels in the full image, (n,) each, from top to bottom."""
+
+    u: Array
+    v: Array
+
+
+class Arms(NamedTuple):
+    """What was found.
+
+    Attributes
+    ----------
+    pieces : of each sheet, from top to bottom.
+    box_px : the width of the line along the rows, roughly, pixels of the full image.
+    """
+
+    pieces: tuple[list[Piece], list[Piece]]
+    box_px: float
+
+
+def reduce(image_bgr: NDArray[np.uint8]) -> Reduced:
+    """An image (H, W[, 3]) about 600 pixels wide."""
+    factor = max(1, round(image_bgr.shape[1] / _WIDTH_PX))
+    height, width = (side // factor for side in image_bgr.shape[:2])
+    first = (factor - 1) // 2
+    rows = image_bgr[first::factor][:height, : width * factor]
+    if factor == 1:
+        return Reduced(rows, 1, 0)
+    return Reduced(np.asarray(cv2.resize(rows, (width, height), interpolation=cv2.INTER_AREA), np.uint8), factor, first)
+
+
+def search(small: Reduced, camera: Camera, light: Laser, parameters: LaserParameters) -> Arms:
+    """Find both arms.
+
+    Parameters
+    ----------
+    small : the reduced image.
+    camera, light : which sheets the arms lie on.
+    parameters : range window, gamma and thresholds.
+    """
+    if min(small.image.shape[:2]) < _SMALLEST_PX:
+        return Arms(([], []), 1.0)
+    seen = evidence(small.image, parameters.gamma)
+    box = _best_box(seen)
+    peaks = _peaks(seen, box, small, parameters)
+    inverse_depth = inverse_depths(camera, light, peaks.u, peaks.v)
+    found = _both(peaks, inverse_depth, len(seen), parameters)
+    pieces = [[_piece(peaks, m) for m in arm.members] if _seen(arm) else [] for arm in found]
+    return Arms((pieces[0], pieces[1]), float(box * small.factor))
+
+
+def _seen(arm: "_Arm") -> bool:
+    """Whether there is an arm: texture makes short pieces, and few that follow each other."""
+    return max(arm.gains, default=0.0) > _LONG_POINTS or sum(arm.gains) > _MANY_POINTS
+
+
+def _both(peaks: Peaks, inverse_depth: tuple[Array, Array], height: int, parameters: LaserParameters) -> list["_Arm"]:
+    """Both arms; a peak that both claim goes to the piece that has more to say for itself."""
+    everything = np.arange(len(peaks.row))
+    found = [_arm(peaks, q, everything, height, parameters) for q in inverse_depth]
+    claim = np.zeros((2, len(peaks.row)))
+    for number, arm in enumerate(found):
+        for members, gain in zip(arm.members, arm.gains, strict=True):
+            claim[number, members] = gain
+    for number, q in enumerate(inverse_depth):
+        lost = (claim[number] > 0) & (claim[number] <= claim[1 - number] - number * 1e-9)
+        if lost.any():
+            found[number] = _arm(peaks, q, np.flatnonzero(~lost), height, parameters)
+    return found
+
+
+def evidence(image: NDArray[np.uint8], gamma: float) -> Floats:
+    """Light of the laser's colour (h, w), linear, 1 where it fills the sensor: the colour that texture least has.
+
+    The weights of the channels are those that give the laser most over the scatter, texture and noise together, of
+    the image from pixel to pixel: C^-1 s, with C that scatter's covariance and s the laser's colour.
+    """
+    light = np.asarray(cv2.LUT(image, linear_light(gamma)), np.float32)
+    if image.ndim == 2:
+        return light
+    some = light[2::5]
+    if np.abs(some - some[..., 1:2]).mean() < 0.002:
+        return np.ascontiguousarray(light[..., 1])
+    rough = (some - cv2.blur(some, (15, 1))).reshape(-1, 3)[::5]
+    limit = 4.5 * np.median(np.abs(rough), axis=0) + 1e-5
+    rough = np.clip(rough, -limit, limit)
+    scatter = (rough.T @ rough / len(rough)).astype(float)
+    weight = np.linalg.solve(scatter + 1e-3 * scatter[1, 1] * np.eye(3), _LASER_BGR)
+    weight /= weight @ _LASER_BGR
+    seen: Floats = np.asarray(cv2.transform(light, weight[None].astype(np.float32)), np.float32)
+    clipped = light[..., 1] > _CLIPPED
+    if clipped[::3].mean() > 1e-4:
+        # the core of an overexposed line is white between green edges
+        closed = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((1, image.shape[1] // 40 | 1), np.uint8))
+        np.copyto(seen, closed, where=clipped)
+    return seen
+
+
+def linear_light(gamma: float) -> Floats:
+    """Linear light (256,), 0..1, of the levels of an image."""
+    return ((np.arange(256) / 255) ** gamma).astype(np.float32)
+
+
+def _lobes(seen: Floats, box: int) -> tuple[Floats, Floats]:
+    """How far the mean over a box (h, w) is above the higher one, and above the mean, of the boxes to both sides."""
+    mean = cv2.blur(seen, (box, 1), borderType=cv2.BORDER_REPLICATE) if box > 1 else seen
+    shift = box + (box + 1) // 2
+    wide = cv2.copyMakeBorder(mean, 0, 0, shift, shift, cv2.BORDER_REPLICATE)
+    left, right = wide[:, : -2 * shift], wide[:, 2 * shift :]
+    return np.asarray(mean - cv2.max(left, right), np.float32), np.asarray(mean - 0.5 * (left + right), np.float32)
+
+
+def _best_box(seen: Floats) -> int:
+    """The box that the line fills best: where the strongest peak of a row stands highest above the scatter."""
+    rows = np.ascontiguousarray(seen[4::12])
+    strength = []
+    for box in _BOXES:
+        if 6 * box > seen.shape[1]:
+            break
+        height, scatter = _lobes(rows, box)
+        strength.append(float(np.median(height.max(axis=1))) / max(float(np.median(np.abs(scatter[:, ::3]))), 1e-6))
+    return _BOXES[int(np.argmax(strength))]
+
+
+def _peaks(seen: Floats, box: int, small: Reduced, parameters: LaserParameters) -> Peaks:
+    height, scatter = _lobes(seen, box)
+    strength = height / _local_scatter(scatter)
+    top = cv2.dilate(strength, np.ones((1, 2 * (box // 2 + 1) + 1), np.uint8))
+    mask = (strength >= top) & (strength > parameters.peak_sigmas)
+    mask[:, 0] = mask[:, -1] = False
+    row, column = np.nonzero(mask)
+    before, at, after = (height[row, column + k].astype(float) for k in (-1, 0, 1))
+    bend = np.maximum(2 * at - before - after, 1e-9)
+    u, v = small.full(row, column + np.clip(0.5 * (after - before) / bend, -0.5, 0.5))
+    return Peaks(row, u, v, strength[row, column].astype(float))
+
+
+def _local_scatter(scatter: Floats) -> Floats:
+    """Robust 1-sigma (h, w) of heights around each pixel, not below a third of that of the whole image."""
+    size = np.abs(scatter)
+    usual = max(float(np.median(size[1::4, 1::3])), 1e-5)
+    cells = (max(scatter.shape[1] // 16, 8), max(scatter.shape[0] // 16, 8))
+    mean = cv2.resize(np.minimum(size, 4 * usual), cells, interpolation=cv2.INTER_AREA)
+    # a mean of sizes is 0.8 sigma
+    sigma = np.maximum(1.25 * cv2.GaussianBlur(mean, (0, 0), 2.0), 0.5 * usual)
+    return np.asarray(cv2.resize(sigma, scatter.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def inverse_depths(camera: Camera, light: Laser, u: Array, v: Array) -> tuple[Array, Array]:
+    """1/Z (N,) of pixels (N,), (N,) on either sheet, 1/m, interpolated between the nodes of a grid (to 0.1 px)."""
+    columns, rows = (max(2, -(-side // _GRID_PX) + 1) for side in (camera.width, camera.height))
+    nodes = np.mgrid[:rows, :columns].reshape(2, -1)[::-1].T * float(_GRID_PX)
+    origin, direction = rays(camera, nodes)
+    at = np.stack([u, v]).astype(np.float32)[..., None] / np.float32(_GRID_PX)
+    found = []
+    for sheet in light.sheets:
+        normal = np.array(sheet.normal)
+        toward, gap = direction @ normal, sheet.offset - origin @ normal
+        grid = toward / (origin[:, 2] * toward + gap * direction[:, 2])
+        found.append(_sampled(np.clip(grid, -100, 100).reshape(rows, columns).astype(np.float32), at))
+    return found[0], found[1]
+
+
+def _sampled(nodes: Floats, at: Floats) -> Array:
+    """Values (N,) of a grid at fractional columns and rows (2, N, 1)."""
+    pieces = [
+        cv2.remap(
+            nodes, at[0, k : k + 30_000], at[1, k : k + 30_000], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        for k in range(0, at.shape[1], 30_000)
+    ]
+    return np.concatenate([np.zeros((0, 1)), *pieces])[:, 0].astype(np.float64)
+
+
+# ------------------------------------------------------------------------------------------------ one arm
+
+
+class _Arm(NamedTuple):
+    """Pieces of one arm, as indices of peaks sorted by row, and what speaks for each, points of 900 rows."""
+
+    members: list[Indices]
+    gains: list[float]
+
+
+def _arm(peaks: Peaks, inverse_depth: Array, usable: Indices, height: int, parameters: LaserParameters) -> _Arm:
+    """The best chain of pieces of line on one sheet, made of usable peaks."""
+    q = inverse_depth[usable]
+    own = usable[(q > 1 / parameters.range_max_m) & (q < 1 / parameters.range_min_m)]
+    if len(own) < parameters.chain_min_points:
+        return _Arm([], [])
+    place = np.zeros(len(inverse_depth))
+    place[own] = _in_columns(peaks.take(own), inverse_depth[own])
+    chain = _without_cliffs(_linked(peaks.row[own], place[own]), peaks.row[own], place[own])
+    length = np.bincount(chain)
+    # of texture everywhere, the longest pieces
+    enough = max(parameters.chain_min_points, int(np.sort(length)[-_PIECES:][0]))
+    members = [own[m] for m in _groups(chain, length >= enough)]
+    if not members:
+        return _Arm([], [])
+    typical = _typical_strength(peaks.strength, members)
+    ends = np.array([[*peaks.row[m[[0, -1]]], *_end_values(place[m])] for m in members])
+    gain = np.array([np.minimum(peaks.strength[m] / typical, 1).sum() for m in members])
+    # a piece of the other arm looks steep
+    steep = np.abs(ends[:, 3] - ends[:, 2]) / (ends[:, 1] - ends[:, 0])
+    gain *= np.maximum(1 - steep / _STEEP_PX, 0) * 900 / height
+    path = _best_path(gain, ends, 900 / height)
+    return _Arm([members[k] for k in path], [float(gain[k]) for k in path])
+
+
+def _in_columns(peaks: Peaks, inverse_depth: Array) -> Array:
+    """Place (N,) on the sheet in pixels of the reduced image: inverse depth over its change from column to column."""
+    step = np.diff(np.unique(peaks.v))
+    factor = float(np.median(step)) if len(step) else 1.0
+    design = np.column_stack([np.ones(len(peaks.u)), peaks.u, peaks.v])
+    per_px = abs(float(np.linalg.lstsq(design, inverse_depth, rcond=None)[0][1]))
+    return inverse_depth / max(per_px * factor, 1e-12)
+
+
+def _linked(row: Indices, place: Array) -> NDArray[np.int32]:
+    """Number of the chain (N,) that each point is on: points of near rows that are each other's nearest hang together.
+
+    Parameters
+    ----------
+    row : (N,) sorted.
+    place : (N,) along the row, on the sheet, pixels of the reduced image.
+    """
+    count = len(row)
+    scale = 4 * (float(np.ptp(place)) + 10)
+    key = row * scale + (place - place.min())
+    order = np.argsort(key)
+    key = key[order]
+    below, above = np.full(count, -1), np.full(count, -1)
+    for gap in range(1, _REACH_ROWS + 1):
+        start, goal = np.flatnonzero(below < 0), np.flatnonzero(above < 0)
+        reach = _NOISE_PX + _SLOPE_PX * gap
+        down, up = (
+            _nearest(key[start] + gap * scale, key[goal], reach),
+            _nearest(key[goal] - gap * scale, key[start], reach),
+        )
+        mutual = np.flatnonzero((down >= 0) & (up[down] == np.arange(len(start))))
+        below[start[mutual]], above[goal[down[mutual]]] = goal[down[mutual]], start[mutual]
+    top = np.flatnonzero(below >= 0)
+    links = coo_array((np.ones(len(top), np.int8), (top, below[top])), shape=(count, count))
+    chain = np.empty(count, np.int32)
+    chain[order] = connected_components(links, directed=False)[1]
+    return chain
+
+
+def _without_cliffs(chain: NDArray, row: Indices, place: Array) -> NDArray:
+    """Chains (N,) cut where they turn off as steeply as the other arm does: there one runs on along the other.
+
+    Points of the steep stretch have chains of their own.
+    """
+    order = np.lexsort((row, chain))
+    ahead, behind = order[_CLIFF_POINTS:], order[:-_CLIFF_POINTS]
+    steep = np.abs(place[ahead] - place[behind]) > _CLIFF_PX * (row[ahead] - row[behind])
+    steep = np.flatnonzero(steep & (chain[ahead] == chain[behind]))
+    alone = np.zeros(len(row), bool)
+    for k in range(_CLIFF_POINTS + 1):
+        alone[steep + k] = True
+    change = (np.diff(chain[order]) != 0) | alone[1:] | alone[:-1]
+    cut = np.empty(len(row), np.intp)
+    cut[order] = np.concatenate([[0], np.cumsum(change)])
+    return cut
+
+
+def _nearest(wanted: Array, key: Array, reach: float) -> Indices:
+    """For each wanted value the index of the nearest of sorted keys, -1 where that is farther than reach."""
+    if not len(key):
+        return np.full(len(wanted), -1)
+    place = np.searchsorted(key, wanted)
+    left, right = np.clip(place - 1, 0, len(key) - 1), np.clip(place, 0, len(key) - 1)
+    nearest = np.where(np.abs(key[left] - wanted) < np.abs(key[right] - wanted), left, right)
+    return np.where(np.abs(key[nearest] - wanted) <= reach, nearest, -1)
+
+
+def _groups(chain: NDArray, wanted: NDArray[np.bool_]) -> list[Indices]:
+    """Indices of the members of each wanted chain, in the order of the points."""
+    members = np.flatnonzero(wanted[chain])
+    members = members[np.argsort(chain[members], kind="stable")]
+    return np.split(members, np.flatnonzero(np.diff(chain[members])) + 1) if len(members) else []
+
+
+def _typical_strength(strength: Array, members: list[Indices]) -> float:
+    """Median strength of points, each counted as often as its chain has points: that of the line, if there is one."""
+    value = np.concatenate([strength[m] for m in members])
+    weight = np.concatenate([np.full(len(m), float(len(m))) for m in members])
+    order = np.argsort(value)
+    heap = np.cumsum(weight[order])
+    return float(value[order][np.searchsorted(heap, 0.5 * heap[-1])])
+
+
+def _end_values(value: Array) -> tuple[float, float]:
+    """Medians of the first and the last five."""
+    return float(np.median(value[:5])), float(np.median(value[-5:]))
+
+
+def _best_path(gain: Array, ends: Array, scale: float) -> list[int]:
+    """Pieces that follow each other down the image, most points for fewest jumps: dynamic programming.
+
+    Parameters
+    ----------
+    gain : (M,) what speaks for each piece, points.
+    ends : (M, 4) first and last row; place on the sheet there, columns of the reduced image.
+    scale : points to a row.
+    """
+    order = np.argsort(ends[:, 0], kind="stable")
+    gain, (top, bottom, at_top, at_bottom) = gain[order], ends[order].T
+    best, previous = gain.copy(), np.full(len(gain), -1)
+    for k in range(1, len(gain)):
+        jump = np.abs(at_top[k] - at_bottom[:k])
+        gap = top[k] - bottom[:k]
+        # what a bottom without steps may do in between costs nothing
+        sudden = np.maximum(jump - _NOISE_PX - _SLOPE_PX * np.maximum(gap, 1), 0)
+        cost = _JUMP_POINTS * jump / np.minimum(at_top[k], at_bottom[:k]) + _STEP_POINTS * np.minimum(sudden, 1)
+        total = best[:k] - cost - np.maximum(1 - gap, 0) * scale
+        total[bottom[:k] >= bottom[k]] = -np.inf
+        i = int(np.argmax(total))
+        if total[i] > 0:
+            best[k], previous[k] = gain[k] + total[i], i
+    path = [int(np.argmax(best))]
+    while previous[path[-1]] >= 0:
+        path.append(int(previous[path[-1]]))
+    return [int(order[k]) for k in reversed(path)]
+
+
+def _piece(peaks: Peaks, members: Indices) -> Piece:
+    """A chain's pixels, one a row, smoothed over three rows."""
+    u, v = peaks.u[members], peaks.v[members]
+    u = np.concatenate([[2 * u[0] - u[1]], u, [2 * u[-1] - u[-2]]])
+    return Piece(np.convolve(u, np.full(3, 1 / 3), "valid"), v)
