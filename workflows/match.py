@@ -186,7 +186,7 @@ def _with_half_turns(
     every = _matches(job, a, b, tuple(np.arange(len(entry.arrays["feature_uv"])) for entry in (a, b)))
     needed = 2 * max(len(best.inliers) if best else 0, job.parameters.match.min_inliers)
     found = best, matched, (False, False)
-    if len(every.features) < needed:
+    if len(every.features) < 3 * needed:  # so few are chance
         return found
     for turned in _HALF_TURNS:
         other = _estimate(job, with_half_turn(prior, *turned), every, soundings, range_m)
