@@ -61,13 +61,15 @@ def read_image(mission: str, image: str, camera: Camera, reduce: int = 1) -> Dec
     Raises
     ------
     UnreadableImage
-        If the file is missing, truncated, damaged or of another size.
+        If the file is truncated, damaged or of another size.
+    OSError
+        If it cannot be read now, which may be no fault of the image.
     """
     fs, root = url_to_fs(mission)
     try:
         content = cast(bytes, fs.cat_file(f"{root.rstrip('/')}/{image}"))
     except OSError as error:
-        raise UnreadableImage(f"file cannot be read ({error.strerror or error})") from None
+        raise OSError(f"{image} cannot be read ({error.strerror or error})") from error
     return DecodedImage(decode(content, camera, reduce), sha256(content))
 
 

@@ -19,6 +19,16 @@ _PERIODIC = {"longitude", "roll", "heading"}
 SIGMAS = ("horizontal", "depth", "roll", "pitch", "heading")
 
 
+# What a vehicle may do in a gap of its navigation: sigma a second from the nearest sample, and at most (m, degrees)
+_UNSEEN = {
+    "horizontal": (0.3, 50.0),
+    "depth": (0.05, 2.0),
+    "roll": (1.0, 3.0),
+    "pitch": (1.0, 3.0),
+    "heading": (15.0, 90.0),
+}
+
+
 class Poses(NamedTuple):
     """Navigation of (N,) images; NaN outside the navigation.
 
@@ -67,7 +77,21 @@ def at_times(navigation: Navigation, ns: Times, offset_s: float, sigma: Navigati
             _interpolate(times, column, ns, False) if known else np.full(len(ns), getattr(sigma, name))
         )
     values = {name: np.where(inside, column, np.nan) for name, column in values.items()}
-    return Poses(values, (first, last), inside & _in_gap(times[_complete(navigation)], ns))
+    complete = times[_complete(navigation)]
+    in_gap = inside & _in_gap(complete, ns)
+    for name, (rate, most) in _UNSEEN.items():
+        unseen = np.minimum(rate * _to_nearest_s(complete, ns), most) * in_gap
+        values[f"sigma_{name}"] = np.hypot(values[f"sigma_{name}"], unseen)
+    return Poses(values, (first, last), in_gap)
+
+
+def _to_nearest_s(times: Times, at: Times) -> Array:
+    """Seconds from each of the times `at` to the nearest sample."""
+    if not len(times):
+        return np.zeros(len(at))
+    after = np.clip(np.searchsorted(times, at), 1, max(1, len(times) - 1))
+    nearest = np.minimum(np.abs(at - times[after - 1]), np.abs(times[np.minimum(after, len(times) - 1)] - at))
+    return nearest * 1e-9
 
 
 def _complete(navigation: Navigation) -> NDArray[np.bool_]:

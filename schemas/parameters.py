@@ -33,7 +33,7 @@ class LaserParameters(Model):
         float, Field(ge=1, le=20, description="second derivative threshold: standard deviations below zero")
     ] = 5.0
     chain_min_points: Annotated[
-        int, Field(ge=1, le=1000, description="a line with fewer points, from row to row, is an orphan")
+        int, Field(ge=2, le=1000, description="a line with fewer points, from row to row, is an orphan")
     ] = 6
     colour_share: Annotated[
         float,

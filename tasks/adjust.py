@@ -28,12 +28,17 @@ _LINK_FLOOR = np.diag([np.radians(0.01)] * 3 + [1e-3] * 3) ** 2
 
 
 class Link(NamedTuple):
-    """The motion between images i < j; whether either lies the other way round than navigation has it."""
+    """The motion between images i < j.
+
+    turned : whether either lies the other way round than navigation has it.
+    free : whether the images, taken one after the other, contradict navigation with many matches.
+    """
 
     i: int
     j: int
     motion: Motion
     turned: tuple[bool, bool] = (False, False)
+    free: bool = False
 
 
 class Adjusted(NamedTuple):
@@ -102,7 +107,7 @@ def _half_turns(count: int, links: list[Link]) -> NDArray[np.bool_]:
 
 
 def _plausible(link: Link, navigation: NavigationPrior | None) -> bool:
-    return link.motion.metric if navigation is None else _agrees_with_navigation(link, navigation)
+    return link.free or (link.motion.metric if navigation is None else _agrees_with_navigation(link, navigation))
 
 
 def _start(count: int, links: list[Link], navigation: NavigationPrior | None, R_first: Array) -> tuple[Poses, Any]:

@@ -84,11 +84,14 @@ def adjust(
     """
     if navigation is not None:
         navigation = with_half_turns(navigation, chained.turned)
-    found = refine(camera, chained.poses, sights, soundings, navigation, p)
-    if found is None:
+    try:
+        found = refine(camera, chained.poses, sights, soundings, navigation, p)
+        if found is None:
+            return chained
+        graph, values = _graph(found.poses, found.block, _COVARIANCE_SIGMA_PX, navigation, p)
+        sigma_m, sigma_tilt = sigmas(graph, values, found.poses, navigation)
+    except RuntimeError:  # GTSAM: something that neither sights nor ranges hold, such as the scale without a laser
         return chained
-    graph, values = _graph(found.poses, found.block, _COVARIANCE_SIGMA_PX, navigation, p)
-    sigma_m, sigma_tilt = sigmas(graph, values, found.poses, navigation)
     return chained._replace(poses=found.poses, sigma_m=sigma_m, sigma_tilt_rad=sigma_tilt)
 
 

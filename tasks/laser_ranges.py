@@ -80,9 +80,9 @@ def _of_image(poses: Poses, k: int, own: Array, X: Array, slope: Array, tree: KD
     near = np.array(sorted(tree.query_ball_point(centre, radius)), np.intp)
     seen = (X[near] - C) @ R
     near, seen = near[seen[:, 2] > 0], seen[seen[:, 2] > 0]
-    lit = KDTree(own[:, :2] / own[:, 2:])
-    distance, which = lit.query(seen[:, :2] / seen[:, 2:], k=min(_NEAREST, len(own)), distance_upper_bound=_REACH)
-    distance, which = np.reshape(distance, (len(near), -1)), np.reshape(which, (len(near), -1))
+    lit, count = KDTree(own[:, :2] / own[:, 2:]), min(_NEAREST, len(own))
+    distance, which = lit.query(seen[:, :2] / seen[:, 2:], k=count, distance_upper_bound=_REACH)
+    distance, which = np.reshape(distance, (len(near), count)), np.reshape(which, (len(near), count))
     order = np.argsort(distance[:, -1], kind="stable")[:most]
     order = order[np.isfinite(distance[order, -1])]
     track, beside = near[order], ground[which[order]]
@@ -92,7 +92,7 @@ def _of_image(poses: Poses, k: int, own: Array, X: Array, slope: Array, tree: KD
     height = np.median(beside[..., 2] + 0.5 * (step * (slope[track][:, None] + at_sounding)).sum(-1), axis=1)
     direction = X[track] - C
     range_m = np.linalg.norm(direction, axis=1) * (height - C[2]) / direction[:, 2]
-    return track, range_m, np.linalg.norm(step, axis=2).min(1)
+    return track, range_m, np.linalg.norm(step, axis=2).min(1, initial=np.inf)
 
 
 def sigma(away_m: Array, roughness: float) -> Array:

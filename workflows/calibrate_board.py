@@ -105,7 +105,7 @@ def _look(folder: Path, setup: BoardSetup, parameters: Parameters) -> _Seen:
         raise InvalidInput([Problem(str(folder), None, "", "no images", "JPEG, PNG or TIFF images", remedy)])
     names, corners, light, sizes = [], [], [], []
     for path in paths:
-        image = cv2.imread(str(path))
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             log.warning("step=calibrate image=%s rejected: it cannot be decoded", path.name)
             continue

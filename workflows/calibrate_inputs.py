@@ -2,7 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import cv2
 import numpy as np
@@ -97,7 +97,7 @@ def _read(survey: Survey, row: int) -> NDArray[np.uint8] | None:
     path = str(survey.opened.frames["image"].values[row])
     try:
         return read_image(survey.url, path, survey.opened.calibration.camera).bgr
-    except UnreadableImage as error:
+    except (UnreadableImage, OSError) as error:
         log.warning("step=calibrate image=%s rejected: %s", path, error)
         return None
 
@@ -124,6 +124,12 @@ def _reference(survey: Survey) -> tuple[NDArray, NDArray]:
     return R, prior.poses.C_local[survey.rows] - R @ np.asarray(mount.translation)
 
 
+def _no_altitude(survey: Survey) -> NoReturn:
+    found, expected = "no altitude near the time of an image", "an altimeter: the laser's scale is measured against it"
+    remedy = "Fill the column altitude of the navigation."
+    raise InvalidInput([Problem(survey.url, None, "navigation", found, expected, remedy)])
+
+
 def flat_data(surveys: list[Survey], lines: list[list[Lines]]) -> FlatData:
     """Points and navigation of one mission or more, images with both lines only."""
     parts = []
@@ -133,6 +139,8 @@ def flat_data(surveys: list[Survey], lines: list[list[Lines]]) -> FlatData:
         assert prior is not None
         keep = np.array([len(one.uv) > 0 for one in found], bool) & np.isfinite(X).all(1)
         altitude = survey.opened.frames["altitude"].values.astype(float)[survey.rows]
+        if not np.isfinite(altitude).any():
+            _no_altitude(survey)
         tilt = prior.sigma_attitude[survey.rows][:, :2].mean(1)
         # each mission has a local frame of its own, and a floor of its own
         columns = R, X, altitude, np.full(len(X), number), prior.sigma_depth[survey.rows], tilt
@@ -196,8 +204,14 @@ def altimeter(survey: Survey) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     ns = samples.ns + round(mission.navigation.time_offset * 1e9)
     known = np.isfinite(samples.altitude) & np.isfinite(slow.depth) & np.isfinite(slow.latitude)
     ns, altitude = ns[known], samples.altitude[known]
-    image = np.abs(ns[:, None] - start[None]).argmin(1)
+    if not len(ns):
+        _no_altitude(survey)
+    after = np.clip(np.searchsorted(start, ns), 1, max(1, len(start) - 1))
+    before_nearer = np.abs(ns - start[after - 1]) <= np.abs(ns - start[np.minimum(after, len(start) - 1)])
+    image = np.where(before_nearer, after - 1, np.minimum(after, len(start) - 1))
     near = np.abs(ns - start[image]) < _NEAR_S * 1e9
+    if not near.any():
+        _no_altitude(survey)
     image, ns, altitude = image[near], ns[near], altitude[near]
     frame = survey.made.frame
     place = [getattr(slow, name)[known][near] for name in ("longitude", "latitude", "depth")]

@@ -11,6 +11,7 @@ from ..catalog.store import Entry
 from ..tasks import camera, features, motion, pairs
 from ..tasks.adjust import Link
 from ..tasks.navigation import Poses, RelativePrior, with_half_turn
+from ..tasks.rotations import angle_between_deg
 from . import extract
 from .job import Done, Job, Made, array_digest, code_version, load, once, stage
 
@@ -30,6 +31,7 @@ class PairTask(NamedTuple):
 
     poses : of these two images. range_m : height above the seabed where the laser does not tell.
     margin_m : how far the relative position may be wrong. lit_i, lit_j : laser images that sound for either.
+    next : whether j was taken right after i, so that they overlap whatever navigation says.
     """
 
     i: int
@@ -40,6 +42,7 @@ class PairTask(NamedTuple):
     margin_m: float
     lit_i: tuple[Lit, ...] = ()
     lit_j: tuple[Lit, ...] = ()
+    next: bool = False
 
     @property
     def rows(self) -> tuple[int, ...]:
@@ -50,6 +53,7 @@ class PairTask(NamedTuple):
 Carried = tuple[tuple[Entry, RelativePrior], ...]
 Soundings = tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]
 _HALF_TURNS = (True, True), (False, True), (True, False)
+_ALIKE_DEG = 20.0
 
 
 def match_batch(job: Job, batch: Sequence[PairTask], extracted: Mapping[int, Done]) -> list[tuple[int, int, Done]]:
@@ -88,6 +92,7 @@ def _match(job: Job, pair: PairTask, keys: Sequence[str], loaded: Mapping[int, E
         round(pair.range_m, 6),
         round(pair.margin_m, 6),
         len(pair.lit_i),
+        pair.next,
     ]
 
     def make() -> Made:
@@ -110,9 +115,13 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
     near = everything if pair.poses is None else _candidates(job, pair, pair.poses, a, b, at)
     matched = _matches(job, a, b, near)
     soundings = _soundings(a, carried[0]), _soundings(b, carried[1])
-    found, turned = _estimate(job, pair.prior, matched, soundings, at), (False, False)
+    found, turned, free = _estimate(job, pair.prior, matched, soundings, at), (False, False), False
     if pair.prior is not None and _weak(found, matched):
-        found, matched, turned = _with_half_turns(job, pair.prior, a, b, (found, matched), soundings, at)
+        every = _matches(job, a, b, everything)
+        needed = 2 * max(len(found.inliers) if found else 0, job.parameters.match.min_inliers)
+        if len(every.features) > 3 * needed:  # fewer are chance
+            best, turned, free = _against_navigation(job, pair, every, needed, soundings, at)
+            found, matched = (found, matched) if best is None else (best, every)
     count = len(matched.features)
     if found is None:
         return Made({}, {"model": "", "matches": count, "inliers": 0})
@@ -132,6 +141,7 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
             "matches": count,
             "inliers": len(found.inliers),
             "turned": list(turned),
+            "free": free,
         },
     )
 
@@ -169,30 +179,33 @@ def _weak(found: motion.Motion | None, matched: Matched) -> bool:
     return found is None or len(found.inliers) < 0.5 * len(matched.features)
 
 
-def _with_half_turns(
-    job: Job,
-    prior: RelativePrior,
-    a: Entry,
-    b: Entry,
-    so_far: tuple[motion.Motion | None, Matched],
-    soundings: Soundings,
-    range_m: float,
-) -> tuple[motion.Motion | None, Matched, tuple[bool, bool]]:
-    """What matches say when either image, or both, may lie the other way round than navigation has it.
+def _against_navigation(
+    job: Job, pair: PairTask, every: Matched, needed: int, soundings: Soundings, range_m: float
+) -> tuple[motion.Motion | None, tuple[bool, bool], bool]:
+    """What matches say if navigation is wrong: believed only if more of them than `needed` agree.
 
-    Believed only when twice as many matches agree to it, and twice as many as make a pair.
+    Either image, or both, may lie the other way round than navigation has it. Two images taken one after the other
+    may be anywhere, for navigation jumps and has gaps; then the laser has to tell the length of their motion.
+
+    Returns
+    -------
+    The motion or None, which images lie the other way round, and whether navigation has no say in it.
     """
-    best, matched = so_far
-    every = _matches(job, a, b, tuple(np.arange(len(entry.arrays["feature_uv"])) for entry in (a, b)))
-    needed = 2 * max(len(best.inliers) if best else 0, job.parameters.match.min_inliers)
-    found = best, matched, (False, False)
-    if len(every.features) < 3 * needed:  # so few are chance
-        return found
-    for turned in _HALF_TURNS:
-        other = _estimate(job, with_half_turn(prior, *turned), every, soundings, range_m)
-        if other is not None and len(other.inliers) > needed:
-            needed, found = len(other.inliers), (other, every, turned)
-    return found
+    assert pair.prior is not None
+    found = _estimate(job, None, every, soundings, range_m)
+    if found is not None and len(found.inliers) > needed:
+        for turned in ((False, False), *_HALF_TURNS):
+            if _alike(found, with_half_turn(pair.prior, *turned)):
+                return found, turned, False
+        if pair.next and found.metric:
+            return found, (False, False), True
+    return None, (False, False), False
+
+
+def _alike(found: motion.Motion, prior: RelativePrior) -> bool:
+    """Whether a motion is roughly one that navigation believes: the same turn, and not into the opposite direction."""
+    turn = angle_between_deg(found.R_i_j, prior.R_i_j)
+    return turn < _ALIKE_DEG and float(found.t_i_j @ prior.t_i_j) > 0
 
 
 def _soundings(entry: Entry, carried: Carried) -> tuple[np.ndarray, float]:
@@ -230,4 +243,4 @@ def link(i: int, j: int, entry: Entry) -> Link:
         scale_sigma=entry.info["scale_sigma"] if entry.info["metric"] else float("nan"),
     )
     turned_i, turned_j = entry.info["turned"]
-    return Link(i, j, found, (turned_i, turned_j))
+    return Link(i, j, found, (turned_i, turned_j), entry.info["free"])

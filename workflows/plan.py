@@ -1,5 +1,6 @@
 """What a mission's frames table says before anything is computed: poses by navigation, pairs, batches."""
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -101,14 +102,17 @@ def first_pairs(made: Plan, opened: OpenedMission, parameters: Parameters) -> li
         return [PairTask(int(rows[a]), int(rows[b]), None, None, ASSUMED_RANGE_M, 0.0) for a, b in found.images]
     margin = _margin(made.prior)
     outlines = pairs.footprints(opened.calibration.camera, made.prior.poses, made.range_m)
-    found = overlapping(outlines, rows, margin, parameters)
+    known = rows[made.prior.poses.known[rows]]
+    following = set(itertools.pairwise(known.tolist()))
+    found = sorted({*overlapping(outlines, rows, margin, parameters), *following})
     lit = _lit(made)
     tasks = []
     for i, j in found:
         prior = navigation.relative(made.prior, i, j)
         spread = 2 * float(np.sqrt(prior.covariance[3:, 3:].trace())) + 0.05 * made.range_m[i]
         poses = _two(made.prior.poses, i, j)
-        tasks.append(PairTask(i, j, poses, prior, float(made.range_m[i]), spread, lit.get(i, ()), lit.get(j, ())))
+        beside = lit.get(i, ()), lit.get(j, ())
+        tasks.append(PairTask(i, j, poses, prior, float(made.range_m[i]), spread, *beside, (i, j) in following))
     return tasks
 
 

@@ -83,14 +83,14 @@ def _bundle(
 ) -> Adjusted:
     camera, p = job.calibration.camera, job.parameters.adjust
     sights = tracks.thin(_sights(job, used), (camera.height, camera.width), p.tie_cells, p.tie_points_per_cell)
-    soundings = {row: load(job, extract.STEP, done.key).arrays["laser_X"] for row, done in lit.items()}
+    soundings = {row: load(job, extract.STEP, done.key, ("laser_X",)).arrays["laser_X"] for row, done in lit.items()}
     return bundle.adjust(camera, chained, sights, soundings, prior, p)
 
 
 def _sights(job: Job, used: Sequence[tuple[int, int, Done]]) -> tracks.Sights:
     matches = []
     for i, j, done in used:
-        arrays = load(job, match.STEP, done.key).arrays
+        arrays = load(job, match.STEP, done.key, ("features", "uv_i", "uv_j")).arrays
         matches.append(tracks.PairMatches(i, j, arrays["features"], arrays["uv_i"], arrays["uv_j"]))
     return tracks.join(matches)
 

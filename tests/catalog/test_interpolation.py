@@ -97,6 +97,11 @@ def test_gaps() -> None:
     # Altitude is missing for 14 s, longer than a gap; positions are not.
     np.testing.assert_array_equal(np.isnan(poses.values["altitude"]), [False, True, False, True, False, False])
     assert np.isfinite(poses.values["latitude"]).all()
+    # what the vehicle did in the gap nobody knows
+    for name, least in (("horizontal", 2.0), ("heading", 60.0)):
+        sigma = poses.values[f"sigma_{name}"]
+        assert (sigma[[0, 1, 2, 4, 5]] < 1).all()
+        assert least < sigma[3] < 2 * least
 
 
 def test_slow_navigation_has_no_gaps() -> None:

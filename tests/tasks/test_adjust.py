@@ -176,3 +176,16 @@ def test_images_that_lie_the_other_way_round_are_found_and_turned():
     assert 0.0005 < _rigid_rms(found.poses.C_local, poses.C_local) < 0.01
     turn = Rotation.from_matrix(found.poses.R_local_camera.transpose(0, 2, 1) @ seen.R_local_camera)
     assert np.degrees(turn.magnitude()).max() < 3
+
+
+def test_a_jump_of_navigation_does_not_tear_the_map():
+    rng, poses = np.random.default_rng(8), _survey()
+    navigation = _navigation(poses, rng)
+    C = navigation.poses.C_local.copy()
+    C[12:] += [8.0, 2.0, 0.0]
+    navigation = navigation._replace(poses=Poses(navigation.poses.R_local_camera, C))
+    links = _links(poses, rng)
+    torn = _run(poses, links, navigation)
+    held = _run(poses, [link._replace(free=link.j == link.i + 1) for link in links], navigation)
+    assert _rigid_rms(torn.poses.C_local, poses.C_local) > 0.3
+    assert 0.0005 < _rigid_rms(held.poses.C_local, poses.C_local) < 0.03

@@ -135,3 +135,11 @@ def test_without_navigation_the_first_image_is_the_datum():
     np.testing.assert_allclose(found.poses.C_local[0], moved.C_local[0], atol=1e-4)
     assert 1e-4 < _rms(found.poses.C_local, poses.C_local) < 0.004
     assert found.sigma_m[0].max() < 1e-4 < found.sigma_m[-1].max() < 0.02
+
+
+def test_what_nothing_holds_leaves_the_start():
+    rng, poses, points = np.random.default_rng(5), _survey(), scenes.seabed(0.15, count=20_000)
+    sights = tracks.join(_matches(LENS, points, poses, rng))
+    alone = sights.take(sights.image != 17)
+    start = _chained(poses)
+    assert bundle.adjust(LENS, start, alone, {}, None, P) is start

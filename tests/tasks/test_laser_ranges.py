@@ -39,6 +39,7 @@ def test_the_nearest_are_taken_first_and_images_without_laser_tell_nothing():
     assert few.away_m.max() <= np.sort(many.away_m)[-1]
     assert set(few.image) == {0}
     assert not len(laser_ranges.measure(poses, X, {}, 10).track)
+    assert not len(laser_ranges.measure(poses, X + [40, 0, 0], soundings, 10).track)  # an image on its own
     assert not len(laser_ranges.measure(poses, X[:0], soundings, 10).track)
 
 
