@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from ..schemas.parameters import AdjustParameters
-from .factors import datum, first_values, gaussian, navigation_factors, pose
+from .factors import datum, first_values, gaussian, navigation_factors, optimise, pose, read_poses, robust
 from .motion import Motion
 from .navigation import NavigationPrior, Poses, relative, with_half_turns
 
@@ -51,6 +51,7 @@ class Adjusted(NamedTuple):
     sigma_tilt_rad : (n,) 1-sigma of the angle by which the optical axis may lean, about either image axis.
     status : per image.
     used : (links,) bool, False for links that contradict navigation or each other.
+    bundled : whether tie points and laser ranges have been adjusted with them.
     turned : (n,) bool, images whose pixels lie the other way round than navigation has them.
     """
 
@@ -60,6 +61,7 @@ class Adjusted(NamedTuple):
     status: list[Status]
     used: NDArray[np.bool_]
     turned: NDArray[np.bool_]
+    bundled: bool = False
 
 
 def adjust(
@@ -78,15 +80,14 @@ def adjust(
     usable = [link for link, ok in zip(links, plausible, strict=True) if ok]
     # once with all, then without the links that contradict the rest
     start, graph = _start(count, usable, navigation, R_first)
-    kernel = gtsam.noiseModel.mEstimator.Huber.Create(p.robust_threshold)
-    values = _solve(graph, _within(usable, start), start, kernel)
+    values = _solve(graph, _within(usable, start), start, p.robust_threshold)
     usable = [link for link in _within(usable, start) if _agrees(link, values)]
     start, graph = _start(count, usable, navigation, R_first)
     usable = _within(usable, start)
-    values = _solve(graph, usable, start, kernel)
+    values = _solve(graph, usable, start, p.robust_threshold)
     kept = {(link.i, link.j) for link in usable}
-    poses = _poses(values, start)
-    sigma_m, sigma_tilt = sigmas(_total(graph, usable, kernel), values, poses, navigation)
+    poses = read_poses(values, start)
+    sigma_m, sigma_tilt = sigmas(_total(graph, usable, p.robust_threshold), values, poses, navigation)
     return Adjusted(
         poses=poses,
         sigma_m=sigma_m,
@@ -183,33 +184,23 @@ def _distance(motion: Motion, other: Any, covariance: Array) -> float:
     return float(np.sqrt(off @ np.linalg.solve(covariance, off) / 6))
 
 
-def _total(graph: Any, links: list[Link], kernel: Any) -> Any:
+def _total(graph: Any, links: list[Link], threshold: float) -> Any:
     """The factors of graph and those of the links under a robust kernel."""
     total = gtsam.NonlinearFactorGraph(graph)
     for link in links:
-        noise = gtsam.noiseModel.Robust.Create(kernel, gaussian(link.motion.covariance + _LINK_FLOOR))
+        noise = robust(gaussian(link.motion.covariance + _LINK_FLOOR), threshold)
         total.add(gtsam.BetweenFactorPose3(link.i, link.j, pose(link.motion.R_i_j, link.motion.t_i_j), noise))
     return total
 
 
-def _solve(graph: Any, links: list[Link], start: Poses, kernel: Any) -> Any:
-    values = first_values(graph, start)
-    total = _total(graph, links, kernel)
-    return gtsam.LevenbergMarquardtOptimizer(total, values, gtsam.LevenbergMarquardtParams()).optimize()
+def _solve(graph: Any, links: list[Link], start: Poses, threshold: float) -> Any:
+    return optimise(_total(graph, links, threshold), first_values(graph, start))
 
 
 def _agrees(link: Link, values: Any) -> bool:
     """Whether the solution is within six sigma of a link's motion."""
     between = values.atPose3(link.i).between(values.atPose3(link.j))
     return _distance(link.motion, between, link.motion.covariance + _LINK_FLOOR) < 6
-
-
-def _poses(values: Any, start: Poses) -> Poses:
-    R, C = np.full_like(start.R_local_camera, np.nan), np.full_like(start.C_local, np.nan)
-    for k in np.flatnonzero(start.known):
-        pose = values.atPose3(int(k))
-        R[k], C[k] = pose.rotation().matrix(), pose.translation()
-    return Poses(R, C)
 
 
 def sigmas(graph: Any, values: Any, poses: Poses, navigation: NavigationPrior | None) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from ..schemas.parameters import AdjustParameters
 from . import laser_ranges
 from .adjust import Adjusted, sigmas
 from .camera import ground_sample_distance, normalised
-from .factors import datum, first_values, navigation_factors
+from .factors import datum, first_values, navigation_factors, optimise, read_poses
 from .laser_ranges import Ranges
 from .navigation import NavigationPrior, Poses, with_half_turns
 from .tracks import Sights
@@ -92,7 +92,7 @@ def adjust(
         sigma_m, sigma_tilt = sigmas(graph, values, found.poses, navigation)
     except RuntimeError:  # GTSAM: something that neither sights nor ranges hold, such as the scale without a laser
         return chained
-    return chained._replace(poses=found.poses, sigma_m=sigma_m, sigma_tilt_rad=sigma_tilt)
+    return chained._replace(poses=found.poses, sigma_m=sigma_m, sigma_tilt_rad=sigma_tilt, bundled=True)
 
 
 def refine(
@@ -119,8 +119,9 @@ def refine(
             return None
         ranges = _believable(poses, X, laser_ranges.measure(poses, X, lit, p.max_ranges), rough)
         graph, values = _graph(poses, Block(sights, x, X, focal_px, ranges, rough), sigma_px, navigation, p)
-        values = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
-        poses, X = _read(values, poses, len(X))
+        values = optimise(graph, values)
+        poses = read_poses(values, poses)
+        X = np.array([values.atPoint3(_tie_point(n)) for n in range(len(X))])
         residual_px = residuals(poses, sights, x, X) * focal_px
         sigma_px, rough = _noise_px(residual_px, len(X)), laser_ranges.roughness(poses, X, ranges)
         bundle = Bundle(poses, Block(sights, x, X, focal_px, ranges, rough), residual_px, sigma_px)
@@ -226,12 +227,3 @@ def _noise_px(residual_px: Array, points: int) -> float:
     freedom = max(0.2, 1 - 3 * points / max(1, residual_px.size))
     spread = _MAD_TO_SIGMA * float(np.median(np.abs(residual_px))) / np.sqrt(freedom)
     return float(np.clip(spread, *_SIGMA_PX))
-
-
-def _read(values: Any, poses: Poses, points: int) -> tuple[Poses, Array]:
-    R, C = poses.R_local_camera.copy(), poses.C_local.copy()
-    for k in np.flatnonzero(poses.known).tolist():
-        found = values.atPose3(k)
-        R[k], C[k] = found.rotation().matrix(), found.translation()
-    X = np.array([values.atPoint3(_tie_point(n)) for n in range(points)]).reshape(-1, 3)
-    return Poses(R, C), X

@@ -44,6 +44,20 @@ def first_values(graph: Any, start: Poses) -> Any:
     return values
 
 
+def optimise(graph: Any, values: Any) -> Any:
+    """The values at which a graph's error is least (Levenberg & Marquardt)."""
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
+
+
+def read_poses(values: Any, start: Poses) -> Poses:
+    """The cameras' poses in values; NaN where they had none to start from."""
+    R, C = np.full_like(start.R_local_camera, np.nan), np.full_like(start.C_local, np.nan)
+    for k in np.flatnonzero(start.known).tolist():
+        found = values.atPose3(k)
+        R[k], C[k] = found.rotation().matrix(), found.translation()
+    return Poses(R, C)
+
+
 def navigation_factors(navigation: NavigationPrior) -> Any:
     """What navigation says of n images, in variables of its own: where it would have been but for its drift.
 

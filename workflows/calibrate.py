@@ -59,13 +59,16 @@ def prepare(out: Path) -> None:
     if (out / CALIBRATION).exists():
         remedy = "Choose another folder; calibrations are never overwritten."
         raise InvalidInput([Problem(str(out / CALIBRATION), None, "", "a calibration", "no such file yet", remedy)])
-    out.mkdir(parents=True, exist_ok=True)
+    if out.exists() and not out.is_dir():
+        remedy = "Give --out a folder, which need not exist."
+        raise InvalidInput([Problem(str(out), None, "", "a file", "a folder", remedy)])
 
 
 def write(out: Path, calibration: Calibration, page: report.Page) -> Written:
     """Write both files, each whole or not at all."""
     content = json.loads(calibration.model_dump_json(exclude_none=True))
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
+    out.mkdir(parents=True, exist_ok=True)
     paths = out / CALIBRATION, out / REPORT
     temporary = paths[0].with_name(f".{CALIBRATION}.{os.getpid()}")
     temporary.write_text(text, encoding="utf-8")

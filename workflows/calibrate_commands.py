@@ -78,11 +78,16 @@ def board(
     model: Annotated[Literal["brown", "fisheye"], typer.Option(help="Camera where there is no --start.")] = "brown",
 ) -> None:
     """Camera and sheets from photographs of a chessboard or ChArUco board in the laser's light."""
+    import cv2
+
     from ..schemas.parameters import Parameters
     from ..tasks.calibration_targets import Board
     from . import calibrate_board
 
     begun = _start(start)
+    if not dictionary.startswith("DICT_") or not hasattr(cv2.aruco, dictionary):
+        remedy = "Write DICT_4X4_50, DICT_5X5_100 or another of OpenCV's."
+        raise InvalidInput([Problem("--dictionary", None, "", dictionary, "a dictionary of markers", remedy)])
     target = Board(kind, columns, rows, 1e-3 * square_mm, marker_share, dictionary)
     setup = calibrate_board.BoardSetup(target, _lines(lines, begun), beside, begun, hold_camera, model)
     _show(calibrate_board.run_board(folder, out, setup, Parameters()))

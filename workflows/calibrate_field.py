@@ -1,7 +1,5 @@
 """`seamosaic calibrate field`: from an ordinary mission's own crossovers."""
 
-import tempfile
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -51,11 +49,10 @@ def calibrate_field(
     """
     survey = inputs.open_survey(url, start, laser_only=False, level_floor=False)
     survey = survey._replace(rows=_together(survey, images))
-    with tempfile.TemporaryDirectory() as scratch:
-        found = inputs.matches(survey, parameters, Path(scratch))
+    found = inputs.matches(survey, parameters)
     made = Measured(survey, inputs.track(survey, parameters), found, inputs.altimeter(survey), _range(survey))
     calibration = survey.opened.calibration
-    starts, x = field.field_starts(calibration), np.zeros(0)
+    starts = field.field_starts(calibration)
     x = np.zeros(field.layout(priors, made.track).scale.size)
     sigma, outcome, problem = np.ones(len(field.GROUPS)), None, None
     for turn in range(_ROUNDS):

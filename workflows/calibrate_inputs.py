@@ -28,6 +28,7 @@ from .job import Job, log
 
 SMOOTH_S = 1.5
 _RATE_STEP_S = 0.25
+_LEAST_IMAGES = 4  # of a mission over a floor
 _NEAR_S = 3.0
 _POINTS_AN_ARM = 300
 
@@ -72,9 +73,10 @@ def open_survey(url: str, start: Calibration | None, laser_only: bool, level_flo
         The mission is wrong, has no navigation or no laser.
     """
     opened = open_mission(url, hashed=False, smooth_s=SMOOTH_S, level_floor=level_floor)
-    if start is not None:
-        opened = opened._replace(calibration=start)
     problems = []
+    if start is not None:
+        problems += _size_problems(url, opened, start)
+        opened = opened._replace(calibration=start)
     if opened.crs is None:
         remedy = "Add navigation to mission.yaml, or calibrate with a board."
         problems.append(Problem(f"{url}/mission.yaml", 1, "navigation", "none", "navigation", remedy))
@@ -86,6 +88,15 @@ def open_survey(url: str, start: Calibration | None, laser_only: bool, level_flo
     made = plan.plan(opened, Parameters())
     wanted = [image.row for image in made.images if not laser_only or image.role != "texture"]
     return Survey(url, opened, made, np.array(wanted, np.intp))
+
+
+def _size_problems(url: str, opened: OpenedMission, start: Calibration) -> list[Problem]:
+    own, given = ((c.camera.width, c.camera.height) for c in (opened.calibration, start))
+    if own == given:
+        return []
+    found, expected = "x".join(map(str, given)), "{}x{}, as the images of {}".format(*own, url)
+    remedy = "Start from a calibration of this camera at this image size."
+    return [Problem("--start", None, "camera", found, expected, remedy)]
 
 
 def spread(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:
@@ -138,6 +149,9 @@ def flat_data(surveys: list[Survey], lines: list[list[Lines]]) -> FlatData:
         prior = survey.made.prior
         assert prior is not None
         keep = np.array([len(one.uv) > 0 for one in found], bool) & np.isfinite(X).all(1)
+        if keep.sum() < _LEAST_IMAGES:
+            shown, remedy = f"{keep.sum()} images with both lines", "Check that the laser was on and the floor is flat."
+            raise InvalidInput([Problem(survey.url, None, "images", shown, f"at least {_LEAST_IMAGES}", remedy)])
         altitude = survey.opened.frames["altitude"].values.astype(float)[survey.rows]
         if not np.isfinite(altitude).any():
             _no_altitude(survey)
@@ -146,10 +160,6 @@ def flat_data(surveys: list[Survey], lines: list[list[Lines]]) -> FlatData:
         columns = R, X, altitude, np.full(len(X), number), prior.sigma_depth[survey.rows], tilt
         parts.append(([one for one, ok in zip(found, keep, strict=True) if ok], [c[keep] for c in columns]))
     told = [one for one_mission, _ in parts for one in one_mission]
-    if len(told) < 4:
-        found = f"{len(told)} images with both lines"
-        remedy = "Check that the laser was on and the floor is flat; look at the images."
-        raise InvalidInput([Problem(surveys[0].url, None, "images", found, "at least 4", remedy)])
     uv, image, arm, sigma = gather(told)
     return FlatData(uv, image, arm, sigma, *[np.concatenate(c) for c in zip(*[c for _, c in parts], strict=True)])
 
@@ -247,18 +257,17 @@ def soundings(survey: Survey, calibration: Calibration, parameters: Parameters) 
     return Points(uv, image.astype(np.intp), arm, np.full(len(uv), 0.3))
 
 
-def matches(survey: Survey, parameters: Parameters, scratch: Path) -> Matches:
+def matches(survey: Survey, parameters: Parameters) -> Matches:
     """Matches of all overlapping pairs of the survey's rows, by feature and epipolar geometry: no laser is asked."""
     calibration, made = survey.opened.calibration, survey.made
-    job = Job(survey.url, survey.opened.mission.id, Store(str(scratch)), calibration, parameters)
-    chosen = {image.row: k for k, image in enumerate([i for i in made.images if i.row in set(survey.rows.tolist())])}
-    of_survey = made._replace(images=tuple(image for image in made.images if image.row in chosen))
+    job = Job(survey.url, survey.opened.mission.id, Store(""), calibration, parameters)  # nothing is stored
+    number = {int(row): k for k, row in enumerate(survey.rows)}
+    of_survey = made._replace(images=tuple(image for image in made.images if image.row in number))
     tasks = plan.first_pairs(of_survey, survey.opened, parameters)
     needed = sorted({row for task in tasks for row in (task.i, task.j)})
     with ThreadPoolExecutor(2) as pool:
         entries = dict(zip(needed, pool.map(lambda row: _entry(survey, row, parameters), needed), strict=True))
         found = list(pool.map(lambda task: match.between(job, task, entries[task.i], entries[task.j]), tasks))
-    number = {int(row): k for k, row in enumerate(survey.rows)}
     linked = [(task, made_) for task, made_ in zip(tasks, found, strict=True) if made_.info["model"]]
     if not linked:
         none = np.zeros(0, np.intp)

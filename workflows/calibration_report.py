@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import jinja2
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from ..schemas.calibration import Calibration
 from ..tasks.calibration_refraction import PinholeError
 from ..tasks.calibration_sheets import Sensitivity
+from .report import template
 from .report_figures import data_uri
 
 Array = NDArray[np.float64]
@@ -35,11 +35,13 @@ class Row(NamedTuple):
 
     @property
     def share(self) -> float:
-        return self.sigma / self.prior if self.prior else 0.0
+        return self.sigma / self.prior if self.prior else 1.0
 
     @property
     def verdict(self) -> str:
-        """What the data say of it."""
+        """What the data say of it, against what was assumed before."""
+        if self.prior is None:
+            return ""
         if self.share < DETERMINED:
             return "determined"
         return "partly determined" if self.share < PARTLY else "not determined"
@@ -84,14 +86,7 @@ class Page(NamedTuple):
 
 def write_page(path: Path, page: Page) -> None:
     """Write the page as one self-contained HTML file."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    path.write_text(environment.get_template("calibration.html").render(page=page), encoding="utf-8")
+    path.write_text(template("calibration.html").render(page=page), encoding="utf-8")
 
 
 def residual_map(

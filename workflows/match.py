@@ -51,7 +51,7 @@ class PairTask(NamedTuple):
 
 
 Carried = tuple[tuple[Entry, RelativePrior], ...]
-Soundings = tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]
+PairSoundings = tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]
 _HALF_TURNS = (True, True), (False, True), (True, False)
 _ALIKE_DEG = 20.0
 
@@ -164,7 +164,7 @@ def _matches(job: Job, a: Entry, b: Entry, index: tuple[np.ndarray, ...]) -> Mat
 
 
 def _estimate(
-    job: Job, prior: RelativePrior | None, matched: Matched, soundings: Soundings, range_m: float
+    job: Job, prior: RelativePrior | None, matched: Matched, soundings: PairSoundings, range_m: float
 ) -> motion.Motion | None:
     lens = job.calibration.camera
     focal_px = range_m / camera.ground_sample_distance(lens, range_m)
@@ -180,7 +180,7 @@ def _weak(found: motion.Motion | None, matched: Matched) -> bool:
 
 
 def _against_navigation(
-    job: Job, pair: PairTask, every: Matched, needed: int, soundings: Soundings, range_m: float
+    job: Job, pair: PairTask, every: Matched, needed: int, soundings: PairSoundings, range_m: float
 ) -> tuple[motion.Motion | None, tuple[bool, bool], bool]:
     """What matches say if navigation is wrong: believed only if more of them than `needed` agree.
 
@@ -209,7 +209,7 @@ def _alike(found: motion.Motion, prior: RelativePrior) -> bool:
 
 
 def _soundings(entry: Entry, carried: Carried) -> tuple[np.ndarray, float]:
-    """Soundings (L, 3) in the frame of an image, and the sigma, metres, that they share.
+    """PairSoundings (L, 3) in the frame of an image, and the sigma, metres, that they share.
 
     An image without a laser has those of the laser images taken just before and after, carried over by navigation.
     """

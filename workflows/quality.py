@@ -74,6 +74,11 @@ def _doubts(rows: Sequence[trajectories.Row], results: Results) -> Iterator[str]
             f"{len(turned)} of {len(rows)} images lie the other way round than mount and heading say, by their matches "
             f"with others, and were placed so (turned by a picture viewer? flown backwards?): {names}"
         )
+    if len(results.posed.solution.pairs) and not results.posed.solution.bundled:
+        yield (
+            "poses are from the motions of pairs alone: tie points were too few, or with the laser's ranges left "
+            "something open, such as the scale"
+        )
     if results.posed.matched and not len(results.posed.solution.pairs):
         yield f"none of {len(results.posed.matched)} pairs of images could be linked"
 

@@ -52,6 +52,18 @@ class FileLine(NamedTuple):
     description: str
 
 
+def template(name: str) -> jinja2.Template:
+    """A page of `templates/`."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(name)
+
+
 def write_report(
     folder: str | os.PathLike[str],
     quality: Quality,
@@ -70,14 +82,7 @@ def write_report(
     root = Path(folder)
     rows = trajectories.read(root / "trajectory.csv")
     rejected = [row for row in rows if row.kind == "rejected"]
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template(_TEMPLATE).render(
+    page = template(_TEMPLATE).render(
         quality=quality,
         title=quality.mission.title or quality.mission.id,
         key_figures=list(_key_figures(quality)),

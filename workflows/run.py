@@ -14,6 +14,7 @@ from dask.delayed import Delayed, delayed
 from ..catalog.missions import OpenedMission, open_mission
 from ..catalog.store import Store
 from ..schemas.parameters import Parameters
+from ..schemas.problems import InvalidInput, Problem
 from ..schemas.products import Quality
 from ..schemas.provenance import Step
 from . import extract, mapping, maps, match, mosaics, plan, products, solve
@@ -62,6 +63,9 @@ def run(
     NothingToMap
         If no image gave a sounding or a match.
     """
+    if Path(out).exists() and not Path(out).is_dir():
+        remedy = "Give -o a folder, which need not exist."
+        raise InvalidInput([Problem(str(out), None, "", "a file", "a folder", remedy)])
     opened = _open(mission_url, out)
     store = Store(str(Path(out).resolve() / opened.mission.id / "steps"))
     url = mission_url if "://" in mission_url else str(Path(mission_url).resolve())
@@ -117,35 +121,39 @@ def _poses(state: Session) -> Posed:
     *parts, adjusted = compute(state, "poses", [*extracts, *matches, last])
     extracted = _by_row(made, parts[: len(extracts)])
     matched = [pair for part in parts[len(extracts) :] for pair in part]
+    adjustments = [adjusted]
     if made.prior is None:
-        matched, adjusted = _close_loops(state, parts[: len(extracts)], matched, adjusted, batch_of)
+        matched = _close_loops(state, parts[: len(extracts)], matched, adjustments, batch_of)
     state.ledger.end(extract.STEP, list(extracted.values()))
     state.ledger.end(match.STEP, [done for _, _, done in matched])
-    state.ledger.end(solve.STEP, [adjusted])
-    return Posed(extracted, matched, adjusted, _solution(job, adjusted))
+    state.ledger.end(solve.STEP, adjustments)
+    return Posed(extracted, matched, adjustments[-1], _solution(job, adjustments[-1]))
 
 
 def _close_loops(
     state: Session,
     extracts: Sequence[list[Done]],
     matched: list[tuple[int, int, Done]],
-    adjusted: Done,
+    adjustments: list[Done],
     batch_of: dict[int, int],
-) -> tuple[list[tuple[int, int, Done]], Done]:
-    """Without navigation: match what overlaps by the poses so far and adjust again, until nothing new overlaps."""
+) -> list[tuple[int, int, Done]]:
+    """Without navigation: match what overlaps by the poses so far and adjust again, until nothing new overlaps.
+
+    All matches; the adjustments are added to those given.
+    """
     job, made = state.job, state.plan
     extracted = _by_row(made, extracts)
     ranges = np.array([mapping.range_of(extracted.get(k), r) for k, r in enumerate(made.range_m)])
     for turn in range(_LOOP_ROUNDS):
         known = [(i, j) for i, j, _ in matched]
-        poses = _solution(job, adjusted).poses
+        poses = _solution(job, adjustments[-1]).poses
         wanted = plan.more_pairs(made, state.opened, job.parameters, poses, ranges, known)
         if not wanted:
             break
         tasks = _match_tasks(state, wanted, extracts, batch_of, f"match-{turn}")
         matched = matched + [pair for part in compute(state, "loops", tasks) for pair in part]
-        (adjusted,) = compute(state, "adjust", [_adjust_task(state, [matched], extracts, f"adjust-{turn}")])
-    return matched, adjusted
+        adjustments += compute(state, "adjust", [_adjust_task(state, [matched], extracts, f"adjust-{turn}")])
+    return matched
 
 
 def _match_tasks(

@@ -79,6 +79,31 @@ def test_a_mission_without_navigation_is_refused(tiny_mission: Path, tmp_path: P
         )
 
 
+BOARD = ["--columns", "9", "--rows", "6", "--square-mm", "30", "--lines", "1"]
+
+
+def test_an_unknown_dictionary_is_refused(tmp_path: Path):
+    arguments = ["calibrate", "board", str(tmp_path), "-o", str(tmp_path / "out"), *BOARD, "--dictionary", "DICT_9"]
+    with pytest.raises(InvalidInput, match="dictionary of markers"):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+
+def test_an_output_that_is_a_file_is_refused_before_any_work(tmp_path: Path):
+    (tmp_path / "out").write_text("")
+    arguments = ["calibrate", "board", str(tmp_path), "-o", str(tmp_path / "out"), *BOARD]
+    with pytest.raises(InvalidInput, match="expected a folder"):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+
+def test_a_start_of_another_image_size_is_refused(tiny_mission: Path, tmp_path: Path):
+    content = yaml.safe_load((tiny_mission / "calibration.yaml").read_text())
+    content["camera"]["width"] += 2
+    (tmp_path / "start.yaml").write_text(yaml.safe_dump(content))
+    arguments = ["calibrate", "flat", str(tiny_mission), "-o", str(tmp_path / "out")]
+    with pytest.raises(InvalidInput, match="--start"):
+        CliRunner().invoke(app, [*arguments, "--start", str(tmp_path / "start.yaml")], catch_exceptions=False)
+
+
 @pytest.mark.slow
 def test_field(tmp_path: Path):
     mission = small_mission(tmp_path / "reef", "reef", images=24, width=1216, survey={"lines": 3})
