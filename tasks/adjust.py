@@ -205,7 +205,12 @@ def _agrees(link: Link, values: Any) -> bool:
 
 def sigmas(graph: Any, values: Any, poses: Poses, navigation: NavigationPrior | None) -> tuple[Array, Array]:
     """Sigmas (n, 3) of the camera centres along the local axes and (n,) of the lean of the optical axes."""
-    marginals = gtsam.Marginals(graph, values)
+    # by QR: that a map may move as a whole by decimetres, but its parts by tenths of millimetres, is too much for
+    # the Cholesky factors of gtsam.Marginals
+    p = gtsam.ISAM2Params()
+    p.setFactorization("QR")
+    marginals = gtsam.ISAM2(p)
+    marginals.update(graph, values)
     count = len(poses.C_local)
     position, tilt = np.full((count, 3), np.nan), np.full(count, np.nan)
     for k in np.flatnonzero(poses.known).tolist():

@@ -28,6 +28,7 @@ _FIRST_SIGMA_PX, _SIGMA_PX = 0.7, (0.1, 2.0)
 _LEAST_PARALLAX = 0.015  # radians
 # before each round, what is farther off is a wrong match: pixels, but not less than sigmas
 _GATES_PX, _GATE_SIGMAS = (100.0, 10.0, 1.0, 0.5), 5.0
+_TOLERANCES = 1e-2, 1e-2, 1e-3, 3e-4  # of each round: what the next one changes anyhow need not be found to the end
 _COVARIANCE_SIGMA_PX = 1.0  # of sights, for the covariances: what calibration leaves is shared by many
 _RANGE_GATE = 6.0  # sigmas
 # The errors of ranges beside each other are alike. Sights hold an image against that; one that has none, as laser
@@ -112,14 +113,14 @@ def refine(
     sights = sights.take(start.known[sights.image])
     bundle, poses = None, start
     sigma_px, rough = _FIRST_SIGMA_PX, laser_ranges.FIRST_ROUGHNESS
-    for gate_px in _GATES_PX:
+    for gate_px, tolerance in zip(_GATES_PX, _TOLERANCES, strict=True):
         gate_px = max(gate_px, _GATE_SIGMAS * sigma_px)
         sights, x, X, focal_px = _inliers(camera, poses, sights, depth, gate_px)
         if not len(X):
             return None
         ranges = _believable(poses, X, laser_ranges.measure(poses, X, lit, p.max_ranges), rough)
         graph, values = _graph(poses, Block(sights, x, X, focal_px, ranges, rough), sigma_px, navigation, p)
-        values = optimise(graph, values)
+        values = optimise(graph, values, tolerance)
         poses = read_poses(values, poses)
         X = np.array([values.atPoint3(_tie_point(n)) for n in range(len(X))])
         residual_px = residuals(poses, sights, x, X) * focal_px

@@ -44,9 +44,14 @@ def first_values(graph: Any, start: Poses) -> Any:
     return values
 
 
-def optimise(graph: Any, values: Any) -> Any:
-    """The values at which a graph's error is least (Levenberg & Marquardt)."""
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
+def optimise(graph: Any, values: Any, tolerance: float = 1e-5) -> Any:
+    """The values at which a graph's error is least (Levenberg & Marquardt).
+
+    tolerance : relative decrease of the error below which the iterations end.
+    """
+    p = gtsam.LevenbergMarquardtParams()
+    p.setRelativeErrorTol(tolerance)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, p).optimize()
 
 
 def read_poses(values: Any, start: Poses) -> Poses:

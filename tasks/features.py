@@ -27,15 +27,17 @@ class Features(NamedTuple):
 def detect(grey: NDArray[np.uint8], ignore: NDArray[np.bool_], parameters: FeatureParameters) -> Features:
     """SIFT features of a grey image (H, W), none of them on pixels to ignore (H, W), such as the laser.
 
-    Images are halved until they have no more than `max_pixels`; the strongest features are kept evenly over the
-    image, so that a bright corner does not take them all.
+    Images with more than `max_pixels` are scaled down to that; the strongest features are kept evenly over the
+    image, so that a bright corner does not take them all. They come strongest first.
     """
-    halvings = 0
-    while grey.size > parameters.max_pixels:
-        grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-        halvings += 1
+    height, width = grey.shape
+    scale = min(1.0, (parameters.max_pixels / grey.size) ** 0.5)
+    if scale < 1:
+        size = round(width * scale), round(height * scale)
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
     mask = cv2.resize((~ignore).astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    sift = cv2.SIFT_create(contrastThreshold=parameters.contrast_threshold)
+    # without precise upscaling all features lie a quarter of a pixel off, which bends surveys with opposite headings
+    sift = cv2.SIFT_create(contrastThreshold=parameters.contrast_threshold, enable_precise_upscale=True)
     found = sift.detect(grey, mask)
     if not found:
         return Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))
@@ -44,8 +46,8 @@ def detect(grey: NDArray[np.uint8], ignore: NDArray[np.bool_], parameters: Featu
     keep = _strongest_everywhere(places, response, grey.shape, parameters.max_features)
     keypoints, descriptors = sift.compute(grey, [found[k] for k in keep])
     uv = np.array([k.pt for k in keypoints], np.float32)
-    # pixel centres at integers: the centre of a halved pixel lies between two full ones
-    full = (uv + 0.5) * 2**halvings - 0.5
+    # pixel centres at integers: it is the corners of the images that coincide
+    full = (uv + 0.5) * [width / grey.shape[1], height / grey.shape[0]] - 0.5
     return Features(full.astype(np.float32), descriptors.astype(np.uint8))
 
 
@@ -66,19 +68,19 @@ def match(descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8], ra
     """Mutual nearest neighbours (M, 2) that pass Lowe's ratio test, by the Hellinger distance (RootSIFT)."""
     if len(descriptors_a) < 2 or len(descriptors_b) < 2:
         return np.zeros((0, 2), np.intp)
-    similarity = _root(descriptors_a) @ _root(descriptors_b).T
+    a, b = unit_root(descriptors_a), unit_root(descriptors_b)
+    similarity = a @ b.T
+    rows = np.arange(len(a))
     best = similarity.argmax(1)
-    rows = np.arange(len(best))
     first = similarity[rows, best]
-    mutual = similarity.argmax(0)[best] == rows
     similarity[rows, best] = -1
-    second = similarity.max(1)
     # |a - b|^2 = 2 - 2 a.b for unit vectors
-    distinct = (1 - first) < ratio**2 * (1 - second)
-    keep = np.flatnonzero(mutual & distinct)
+    distinct = np.flatnonzero((1 - first) < ratio**2 * (1 - similarity.max(1)))
+    back = (b[best[distinct]] @ a.T).argmax(1)  # of the few that are left: looking down columns is slow
+    keep = distinct[back == distinct]
     return np.column_stack([keep, best[keep]])
 
 
-def _root(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+def unit_root(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
     values = descriptors.astype(np.float32)
     return np.sqrt(values / np.maximum(values.sum(1, keepdims=True), 1))

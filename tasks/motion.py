@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from ..schemas.parameters import MatchParameters
 from .navigation import RelativePrior
@@ -24,7 +23,7 @@ _SCALE_RADIUS = 0.03  # slope within which a sounding tells a feature's depth: 9
 _MIN_SCALE_FEATURES = 5
 _LASER_CONTRADICTS = 0.1  # spread of the depth ratios beyond which a motion is not the right one
 _UNIT_LENGTH_SIGMA = 1e-3
-_MAX_MATCHES = 1500
+_MAX_MATCHES = 500
 
 
 class Plane(NamedTuple):
@@ -154,7 +153,7 @@ def _starts(
 
 def _from_unknown_plane(x_i: Array, x_j: Array, focal_px: float, parameters: MatchParameters) -> list[_Start]:
     """Decompositions of the homography whose plane lies in front of the camera."""
-    H, mask = cv2.findHomography(x_i, x_j, cv2.RANSAC, parameters.inlier_px / focal_px, maxIters=2000, confidence=0.999)
+    H, mask = _homography(x_i, x_j, focal_px, parameters)
     if H is None or mask.sum() < parameters.min_inliers:
         return []
     inliers = np.flatnonzero(mask.ravel())
@@ -167,9 +166,14 @@ def _from_unknown_plane(x_i: Array, x_j: Array, focal_px: float, parameters: Mat
     return starts
 
 
+def _homography(x_i: Array, x_j: Array, focal_px: float, parameters: MatchParameters):
+    threshold = parameters.inlier_px / focal_px
+    return cv2.findHomography(x_i, x_j, cv2.USAC_FAST, threshold, maxIters=2000, confidence=0.999)
+
+
 def _from_homography(x_i: Array, x_j: Array, plane: Plane, focal_px: float, parameters: MatchParameters):
     """H = R + t n' / D by RANSAC and its decomposition (Faugeras & Lustman) nearest to the laser's plane."""
-    H, mask = cv2.findHomography(x_i, x_j, cv2.RANSAC, parameters.inlier_px / focal_px, maxIters=2000, confidence=0.999)
+    H, mask = _homography(x_i, x_j, focal_px, parameters)
     if H is None or mask.sum() < parameters.min_inliers:
         return None
     _, rotations, translations, normals = cv2.decomposeHomographyMat(H, np.eye(3))
@@ -184,7 +188,7 @@ def _from_homography(x_i: Array, x_j: Array, plane: Plane, focal_px: float, para
 def _from_essential(x_i: Array, x_j: Array, focal_px: float, parameters: MatchParameters):
     """Essential matrix by RANSAC and the decomposition that puts the points in front of both cameras."""
     E, mask = cv2.findEssentialMat(
-        x_i, x_j, np.eye(3), cv2.RANSAC, prob=0.9999, threshold=parameters.inlier_px / focal_px, maxIters=3000
+        x_i, x_j, np.eye(3), cv2.USAC_FAST, prob=0.9999, threshold=parameters.inlier_px / focal_px, maxIters=3000
     )
     if E is None or E.shape != (3, 3) or mask.sum() < parameters.min_inliers:
         return None
@@ -214,11 +218,11 @@ def _from_prior(x_i: Array, x_j: Array, prior: RelativePrior, focal_px: float, p
 
 
 def _log(R: Array, v: Array) -> Array:
-    return np.concatenate([Rotation.from_matrix(R).as_rotvec(), v])
+    return np.concatenate([cv2.Rodrigues(R)[0].ravel(), v])
 
 
 def _moved(start_R: Array, start_t: Array, step: Array) -> tuple[Array, Array]:
-    return start_R @ Rotation.from_rotvec(step[:3]).as_matrix(), start_t + start_R @ step[3:]
+    return start_R @ cv2.Rodrigues(step[:3])[0], start_t + start_R @ step[3:]
 
 
 def _homogeneous(x: Array) -> Array:
@@ -308,9 +312,13 @@ def _minimise_sampson(x_i: Array, x_j: Array, R: Array, t: Array, focal_px: floa
     length = 1.0 if prior is None else float(np.linalg.norm(prior.t_i_j))
     whiten = None if prior is None else np.linalg.cholesky(np.linalg.inv(prior.covariance)).T
 
+    p_i, p_j = _homogeneous(x_i), _homogeneous(x_j)
+
     def residuals(step: Array) -> Array:
         R_step, t_step = _moved(R, t, step)
-        rows = np.append(sampson(x_i, x_j, R_step, t_step) / sigma, np.log(np.linalg.norm(t_step)) / _UNIT_LENGTH_SIGMA)
+        rows = np.append(
+            _sampson(p_i, p_j, R_step, t_step) / sigma, np.log(np.linalg.norm(t_step)) / _UNIT_LENGTH_SIGMA
+        )
         if prior is None or whiten is None:
             return rows
         off = _log(prior.R_i_j.T @ R_step, prior.R_i_j.T @ (t_step * length - prior.t_i_j))
@@ -339,10 +347,13 @@ def _covariance(jacobian: Array, residual: Array) -> Array:
 
 def sampson(x_i: Array, x_j: Array, R_i_j: Array, t_i_j: Array) -> Array:
     """Signed Sampson distance (N,) in slopes of matches (N, 2) from the epipolar geometry of a motion."""
+    return _sampson(_homogeneous(x_i), _homogeneous(x_j), R_i_j, t_i_j)
+
+
+def _sampson(p_i: Array, p_j: Array, R_i_j: Array, t_i_j: Array) -> Array:
     t = t_i_j / np.linalg.norm(t_i_j)
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     E = (cross @ R_i_j).T  # x_j' E x_i = 0
-    p_i, p_j = _homogeneous(x_i), _homogeneous(x_j)
     line_j, line_i = p_i @ E.T, p_j @ E
     norm = np.sqrt((line_j[:, :2] ** 2).sum(1) + (line_i[:, :2] ** 2).sum(1))
     return np.einsum("ij,ij->i", p_j, line_j) / np.maximum(norm, 1e-12)

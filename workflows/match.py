@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ..catalog.store import Entry
-from ..tasks import camera, features, motion, pairs
+from ..tasks import camera, features, guided, motion, pairs
 from ..tasks.adjust import Link
 from ..tasks.navigation import Poses, RelativePrior, with_half_turn
 from ..tasks.rotations import angle_between_deg
@@ -54,6 +54,7 @@ Carried = tuple[tuple[Entry, RelativePrior], ...]
 PairSoundings = tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]
 _HALF_TURNS = (True, True), (False, True), (True, False)
 _ALIKE_DEG = 20.0
+_STRONGEST = 1500  # features of an image that are asked whether navigation is wrong
 
 
 def match_batch(job: Job, batch: Sequence[PairTask], extracted: Mapping[int, Done]) -> list[tuple[int, int, Done]]:
@@ -117,7 +118,7 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
     soundings = _soundings(a, carried[0]), _soundings(b, carried[1])
     found, turned, free = _estimate(job, pair.prior, matched, soundings, at), (False, False), False
     if pair.prior is not None and _weak(found, matched):
-        every = _matches(job, a, b, everything)
+        every = _matches(job, a, b, (everything[0][:_STRONGEST], everything[1][:_STRONGEST]))
         needed = 2 * max(len(found.inliers) if found else 0, job.parameters.match.min_inliers)
         if len(every.features) > 3 * needed:  # fewer are chance
             best, turned, free = _against_navigation(job, pair, every, needed, soundings, at)
@@ -125,21 +126,22 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
     count = len(matched.features)
     if found is None:
         return Made({}, {"model": "", "matches": count, "inliers": 0})
+    agreed = _guided(job, found, matched.features[found.inliers], a, b, at)
     return Made(
         {
             "R": found.R_i_j,
             "t": found.t_i_j,
             "covariance": found.covariance,
-            "uv_i": matched.uv_i[found.inliers].astype(np.float32),
-            "uv_j": matched.uv_j[found.inliers].astype(np.float32),
-            "features": matched.features[found.inliers].astype(np.int32),
+            "uv_i": a.arrays["feature_uv"][agreed[:, 0]],
+            "uv_j": b.arrays["feature_uv"][agreed[:, 1]],
+            "features": agreed.astype(np.int32),
         },
         {
             "model": found.model,
             "metric": found.metric,
             "scale_sigma": found.scale_sigma if found.metric else None,
             "matches": count,
-            "inliers": len(found.inliers),
+            "inliers": len(agreed),
             "turned": list(turned),
             "free": free,
         },
@@ -161,6 +163,14 @@ def _matches(job: Job, a: Entry, b: Entry, index: tuple[np.ndarray, ...]) -> Mat
     numbers = np.column_stack([index[0][matches[:, 0]], index[1][matches[:, 1]]])
     uv_a, uv_b = (entry.arrays["feature_uv"][n].astype(float) for entry, n in zip((a, b), numbers.T, strict=True))
     return Matched(uv_a, uv_b, numbers)
+
+
+def _guided(job: Job, found: motion.Motion, known: np.ndarray, a: Entry, b: Entry, range_m: float) -> np.ndarray:
+    """The matches (M, 2) that a motion leads to."""
+    lens = job.calibration.camera
+    sides = [features.Features(entry.arrays["feature_uv"], entry.arrays["feature_descriptors"]) for entry in (a, b)]
+    slopes = [camera.normalised(lens, side.uv.astype(float), range_m) for side in sides]
+    return guided.match(*sides, *slopes, known, found, range_m / camera.ground_sample_distance(lens, range_m))
 
 
 def _estimate(

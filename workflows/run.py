@@ -73,7 +73,7 @@ def run(
     log.info("mission=%s step=open images=%d", opened.mission.id, opened.frames.sizes["image"])
     with open_executor(scheduler, workers) as executor:
         state = Session(job, opened, plan.plan(opened, parameters), executor, Ledger())
-        posed = _poses(state)
+        posed = poses(state)
         mapped = mapping.map_tiles(state, posed)
     steps = state.ledger.steps(_VERSIONS)
     path, new, quality = products.write(Results(job, opened, state.plan, Path(out), steps, posed, mapped))
@@ -105,7 +105,7 @@ def _open(mission_url: str, out: Path) -> OpenedMission:
     return opened
 
 
-def _poses(state: Session) -> Posed:
+def poses(state: Session) -> Posed:
     """One graph over batches of images, then pairs, then the adjustment; without navigation, loops after it."""
     job, made = state.job, state.plan
     for step in (extract.STEP, match.STEP, solve.STEP):

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from seamosaic.schemas.parameters import MatchParameters
 from seamosaic.tasks import motion, rotations
 from seamosaic.tasks.navigation import RelativePrior
@@ -27,7 +28,7 @@ def test_the_motion_is_metric_and_its_covariance_honest(relief_m, model):
         assert found is not None
         assert found.model == model
         assert found.metric
-        off = np.concatenate([motion.Rotation.from_matrix(R.T @ found.R_i_j).as_rotvec(), R.T @ (found.t_i_j - t)])
+        off = np.concatenate([Rotation.from_matrix(R.T @ found.R_i_j).as_rotvec(), R.T @ (found.t_i_j - t)])
         errors.append(np.linalg.norm(found.t_i_j - t))
         scores.append(off @ np.linalg.solve(found.covariance, off) / 6)
     assert 2e-4 < np.median(errors) < 8e-3
