@@ -174,22 +174,25 @@ def _column_at(rows: _Rows, v: Indices) -> Array:
 def _strip(
     image: NDArray[np.uint8], v: Indices, centre: Indices, half: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Green levels (N, 2 half + 1) around a column in each row, and which of them are in the image.
+    """Pixels (N, 2 half + 1[, 3]) around a column in each row, and which of them are in the image.
 
     Those that are not repeat the row's last pixel.
     """
-    width, size = image.shape[1], 2 * half + 1
-    green = image[..., 1] if image.ndim == 3 else image
-    step = green.strides[1]
+    width, size, depth = image.shape[1], 2 * half + 1, image.shape[2] if image.ndim == 3 else 1
     # windows of consecutive pixels, of any start: the rows of an image lie one behind the other
-    windows = as_strided(green, (green.size - size + 1, size), (step, step), writeable=False)
-    level = windows[np.clip(v * width + centre - half, 0, len(windows) - 1)]
-    inside = np.ones(level.shape, bool)
+    windows = as_strided(image, (image.size - size * depth + 1, size * depth), (1, 1), writeable=False)
+    level = windows[np.clip((v * width + centre - half) * depth, 0, len(windows) - 1)]
+    level = level.reshape(len(v), size, *image.shape[2:])
+    inside = np.ones(level.shape[:2], bool)
     cut = np.flatnonzero((centre < half) | (centre >= width - half))
     column = centre[cut, None] + np.arange(-half, half + 1)
     inside[cut] = (column >= 0) & (column < width)
-    level[cut] = green[v[cut, None], np.clip(column, 0, width - 1)]
+    level[cut] = image[v[cut, None], np.clip(column, 0, width - 1)]
     return level, inside
+
+
+def _green(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return image if image.ndim == 2 else np.asarray(cv2.extractChannel(image, 1), np.uint8)
 
 
 def _centred(image: NDArray[np.uint8], rows: _Rows, box_px: float, factor: int) -> _Rows:
@@ -200,7 +203,7 @@ def _centred(image: NDArray[np.uint8], rows: _Rows, box_px: float, factor: int) 
     reach, wide = factor // columns + 1, int(np.ceil(1.5 * box_px / columns)) + 1
     v, centre = rows.v[::every], np.round(rows.u[::every]).astype(np.intp)
     half = reach + wide
-    level = _averaged(_strip(image, v, centre, half * columns + columns // 2)[0], columns)
+    level = _averaged(_green(_strip(image, v, centre, half * columns + columns // 2)[0]), columns)
     sigma = max(0.4 * box_px / columns, 0.8)
     narrow = cv2.GaussianBlur(cv2.blur(level, (1, 7 if every == 1 else 5)), (2 * int(2.5 * sigma) + 1, 1), sigma)
     broad = cv2.blur(narrow, (2 * wide + 1, 1))
@@ -226,8 +229,8 @@ def _averaged(values: NDArray, columns: int) -> Floats:
 
 def _typical_width(image: NDArray[np.uint8], v: Indices, centre: Indices, box_px: float, linear: Floats) -> float:
     """Standard deviation in pixels of the median profile of rows in which the line's column is known to a pixel."""
-    half, some = int(np.ceil(1.7 * box_px)) + 2, slice(None, None, max(1, len(v) // 300))
-    light = linear[_strip(image, v[some], centre[some], half)[0]]
+    half, some = int(np.ceil(1.7 * box_px)) + 2, slice(None, None, max(1, len(v) // 150))
+    light = linear[_green(_strip(image, v[some], centre[some], half)[0])]
     ends = max(1, half // 4)
     ground = 0.5 * (light[:, :ends].mean(axis=1) + light[:, -ends:].mean(axis=1))
     profile = np.median(light - ground[:, None], axis=0).astype(float)
@@ -250,17 +253,18 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     columns = 1 + 2 * int(width / 4)
     half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
     level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
-    light = _averaged(np.asarray(cv2.LUT(level, linear), np.float32), columns)
-    used, unclipped = _all(inside, columns), _all(level < _CLIPPED, columns)
-    used &= ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns)
+    green = _green(level)
+    light = cv2.transpose(_averaged(np.asarray(cv2.LUT(green, linear), np.float32), columns))
+    used, unclipped = _all(inside, columns).T, _all(green < _CLIPPED, columns).T
+    used = used & ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns).T
     light -= gaussian_fit.ground(light, used, width / columns)
-    typical = int(np.median(level[::7, ::3]))
+    typical = int(np.median(green[::7, ::3]))
     floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
     found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
     fit = _Fit(u, sigma, width, found.signal_to_noise)
     if image.ndim == 3:
-        white = _white(image, rows.v, fit, linear) & unclipped[:, half - 1 : half + 2].all(axis=1)
+        white = _white(image, rows.v, fit, linear) & unclipped[half - 1 : half + 2].all(axis=0)
         fit = fit._replace(u=np.where(white, np.nan, u))
     strange = (found.height > _BRIGHT * _usual(found.height)) | (found.misfit > _MISFIT)
     return _accepted(fit._replace(u=np.where(strange, np.nan, fit.u)), rows, image.shape[1])
