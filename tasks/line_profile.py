@@ -26,10 +26,9 @@ APART: Final = 4.5
 # A point less sure than this share of the width is none; nor is one so many times as bright as its neighbours.
 _VAGUE: Final = 0.5
 _BRIGHT: Final = 3.0
-# Nor, if it stands out clearly, one with this share of the blue and red of white light.
-_WHITE: Final = 0.7
-_COLOUR_SNR: Final = 8.0
-_COLOUR_ROWS: Final = 21
+# Blue and red, as a share of the line's green, that the laser does not have; and over their scatter.
+_WHITE: Final = 0.4
+_CLEARLY: Final = 6.0
 # Nor one whose profile is so much less like a line than those around it.
 _MISFIT: Final = 4.0
 # How far from the line's rough place, in widths, it may be found.
@@ -254,37 +253,39 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
     level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
     green = _green(level)
-    light = cv2.transpose(_averaged(np.asarray(cv2.LUT(green, linear), np.float32), columns))
+    light = np.asarray(cv2.transpose(_averaged(np.asarray(cv2.LUT(green, linear), np.float32), columns)), np.float32)
     used, unclipped = _all(inside, columns).T, _all(green < _CLIPPED, columns).T
     used = used & ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns).T
     light -= gaussian_fit.ground(light, used, width / columns)
+    if image.ndim == 3:
+        used &= ~_white(level, light, columns, linear)
     typical = int(np.median(green[::7, ::3]))
     floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
     found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
-    fit = _Fit(u, sigma, width, found.signal_to_noise)
-    if image.ndim == 3:
-        white = _white(image, rows.v, fit, linear) & unclipped[half - 1 : half + 2].all(axis=0)
-        fit = fit._replace(u=np.where(white, np.nan, u))
     strange = (found.height > _BRIGHT * _usual(found.height)) | (found.misfit > _MISFIT)
-    return _accepted(fit._replace(u=np.where(strange, np.nan, fit.u)), rows, image.shape[1])
+    fit = _Fit(np.where(strange, np.nan, u), sigma, width, found.signal_to_noise)
+    return _accepted(fit, rows, image.shape[1])
 
 
-def _white(image: NDArray[np.uint8], v: Indices, fit: _Fit, linear: Floats) -> NDArray[np.bool_]:
-    """Which points (N,) add to blue and red what white light would: bubbles, shells. Clipped ones cannot be told."""
-    side = np.round(gaussian_fit.GROUND * fit.width)[:, None] * np.array([-1.0, 0.0, 1.0])
-    column = np.clip(np.round(fit.u)[:, None] + side, 0, image.shape[1] - 1).astype(np.intp)
-    level = image[v[:, None], column]
-    light = linear[level]
-    beside = 0.5 * (light[:, 0] + light[:, 2])
-    added = light[:, 1] - beside
-    around = cv2.blur(beside, (1, _COLOUR_ROWS), borderType=cv2.BORDER_REFLECT)
-    expected = (around[:, 0] + around[:, 2]) * added[:, 1]
-    # without light of another source beside the line there is nothing to compare with
-    told = (fit.signal_to_noise > _COLOUR_SNR) & (around[:, 1] > np.maximum(0.02, 0.1 * added[:, 1]))
-    white = told & ((added[:, 0] + added[:, 2]) * around[:, 1] > _WHITE * expected)
+def _white(level: NDArray[np.uint8], light: Floats, columns: int, linear: Floats) -> NDArray[np.bool_]:
+    """Pixels (M, N) with more blue and red than the laser has: bubbles, shells, edges of pale stones.
+
+    Parameters
+    ----------
+    level : (N, columns M, 3) pixels.
+    light : (M, N) green light above the ground.
+    """
+    other = np.asarray(cv2.transform(cv2.LUT(level, linear), np.array([[0.5, 0, 0.5]], np.float32)), np.float32)
+    other = np.asarray(cv2.transpose(_averaged(other, columns)), np.float32)
+    usual = _usual(cv2.reduce(other, 0, cv2.REDUCE_AVG).ravel()).astype(np.float32)
+    other -= usual
+    middle = len(light) // 2
+    height = _usual(light[middle - 1 : middle + 2].max(axis=0)).astype(np.float32)
+    scatter = 1.4826 * float(np.median(np.abs(other[::3, ::16])))
+    white = other > np.maximum(_WHITE * height, np.float32(_CLEARLY * scatter))
     # where most of the line is white the image has no colour
-    return white & (white.mean() < 0.5)
+    return white & (white[middle].mean() < 0.5)
 
 
 def _usual(height: Array) -> Array:

@@ -361,8 +361,9 @@ def _typical_strength(strength: Array, members: list[Indices]) -> float:
 
 
 def _end_values(value: Array) -> tuple[float, float]:
-    """Medians of the first and the last five."""
-    return float(np.median(value[:5])), float(np.median(value[-5:]))
+    """Middle values of the first and the last five."""
+    first, last = sorted(value[:5].tolist()), sorted(value[-5:].tolist())
+    return first[len(first) // 2], last[len(last) // 2]
 
 
 def _best_path(gain: Array, ends: Array, scale: float, stretch: float) -> list[int]:
