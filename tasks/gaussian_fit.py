@@ -56,10 +56,10 @@ class Fit(NamedTuple):
 class _State(NamedTuple):
     """Of each profile (N,): place, width, height; normal equations of height and place."""
 
-    place: Floats
-    width: Floats
-    height: Floats
-    normals: tuple[Floats, Floats, Floats]
+    place: NDArray
+    width: NDArray
+    height: NDArray
+    normals: tuple[NDArray, NDArray, NDArray]
 
 
 def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> Fit:
@@ -106,7 +106,7 @@ def ground(light: Floats, used: NDArray[np.bool_], width: float) -> Floats:
     return np.asarray(left + (right - left) * share, np.float32)
 
 
-def _dot(a: Floats, b: Floats) -> Floats:
+def _dot(a: NDArray, b: NDArray) -> NDArray:
     """Sums (N,) over the profiles of a * b, (M, N) each."""
     return np.einsum("ij,ij->j", a, b)
 
@@ -121,12 +121,12 @@ def _first(light: Floats, x: Floats, width: float) -> _State:
     """The first step from the middle, all pixels used: the same weights for all profiles."""
     t = x / np.float32(width)
     g = np.exp(np.float32(-0.5) * t * t) * (np.abs(t) < FIT)
-    gg, dd, ss = (float((g * g * t**power).sum()) for power in (0, 2, 4))
+    gg, dd, ss = ((g * g * t**power).sum(axis=0) for power in (0, 2, 4))
     gp, dp, sp = np.hstack([g, g * t, g * t * t]).T @ light
     height = np.maximum(gp / gg, np.float32(1e-7))
-    sums = _Sums(np.float32(gg), np.float32(0), np.float32(dd), np.float32(ss), gp, dp, sp)
+    sums = _Sums(gg, np.zeros_like(gg), dd, ss, gp, dp, sp)
     start = np.full(light.shape[1], np.float32(width))
-    step = np.clip(dp / np.float32(dd) / height, -1, 1)
+    step = np.clip(dp / dd / height, -1, 1)
     place = np.clip(start * step, x[0], x[-1])
     return _State(place, _wider(start, height, sums), height, (gp, gp, gp))
 
@@ -134,10 +134,10 @@ def _first(light: Floats, x: Floats, width: float) -> _State:
 class _Sums(NamedTuple):
     """Over each profile (N,), t the distance from the place in widths: of w g^2 t^k, k 0, 1, 2, 4; w g light t^k."""
 
-    a0: Floats | np.float32
-    a1: Floats | np.float32
-    a2: Floats | np.float32
-    a4: Floats | np.float32
+    a0: NDArray
+    a1: NDArray
+    a2: NDArray
+    a4: NDArray
     b0: Floats
     b1: Floats
     b2: Floats
@@ -164,7 +164,7 @@ def _improved(state: _State, light: Floats, mask: Floats, x: Floats, noise: Nois
     return _State(place, width if last else _wider(width, height, sums), height, normals)
 
 
-def _gaussian(state: _State, x: Floats) -> tuple[Floats, Floats, Floats]:
+def _gaussian(state: _State, x: Floats) -> tuple[NDArray, NDArray, NDArray]:
     """Distance from the place in widths (M, N), its square, and the Gaussian."""
     t = (x - state.place) * (1 / state.width)
     square = t * t
@@ -209,19 +209,19 @@ def _noise(state: _State, light: Floats, mask: Floats, x: Floats, floor: float) 
     return float(beside), float(linear / beside), float(square / beside)
 
 
-def _share(height: Floats) -> Floats:
+def _share(height: NDArray) -> NDArray:
     """Height of each line (N,) over that of most."""
     return np.minimum(height / np.float32(max(float(np.median(height)), 1e-9)), np.float32(4))
 
 
-def _variance(height: Floats, gaussian: Floats, noise: Noise) -> Floats:
+def _variance(height: NDArray, gaussian: NDArray, noise: Noise) -> NDArray:
     """Of each pixel (M, N), over that beside the line."""
     linear, square = np.float32(noise[1]), np.float32(noise[2])
     on = _share(height) * gaussian
     return np.float32(1) + on * (linear + square * on)
 
 
-def _noise_level(state: _State, light: Floats, mask: Floats, x: Floats, noise: Noise) -> tuple[Floats, Floats]:
+def _noise_level(state: _State, light: Floats, mask: Floats, x: Floats, noise: Noise) -> tuple[NDArray, NDArray]:
     """Scatter of the residuals (N,) over what was expected, of some rows together; its square in each row to that."""
     gaussian = _gaussian(state, x)[2]
     residual = light - state.height * gaussian

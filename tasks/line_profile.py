@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from . import gaussian_fit
-from .sheet_search import Arms, Piece, linear_light
+from .sheet_search import Arms, Piece, colourless, laser_weights, linear_light
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -29,6 +29,9 @@ _BRIGHT: Final = 3.0
 # Blue and red, as a share of the line's green, that the laser does not have; and over their scatter.
 _WHITE: Final = 0.4
 _CLEARLY: Final = 6.0
+_OTHER: Final = np.array([[0.5, 0, 0.5]], np.float32)
+# Rows over which the ground's colour is averaged.
+_GROUND_ROWS: Final = 31
 # Nor one whose profile is so much less like a line than those around it.
 _MISFIT: Final = 4.0
 # How far from the line's rough place, in widths, it may be found.
@@ -252,13 +255,13 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     columns = 1 + 2 * int(width / 4)
     half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
     level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
-    green = _green(level)
-    light = np.asarray(cv2.transpose(_averaged(np.asarray(cv2.LUT(green, linear), np.float32), columns)), np.float32)
+    green, shine = _green(level), _averaged_linear(level, columns, linear)
     used, unclipped = _all(inside, columns).T, _all(green < _CLIPPED, columns).T
     used = used & ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns).T
+    light = _laser_light(shine, gaussian_fit.GROUND * width / columns)
     light -= gaussian_fit.ground(light, used, width / columns)
     if image.ndim == 3:
-        used &= ~_white(level, light, columns, linear)
+        used &= ~_white(shine, light)
     typical = int(np.median(green[::7, ::3]))
     floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
     found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
@@ -268,16 +271,38 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     return _accepted(fit, rows, image.shape[1])
 
 
-def _white(level: NDArray[np.uint8], light: Floats, columns: int, linear: Floats) -> NDArray[np.bool_]:
+def _averaged_linear(level: NDArray[np.uint8], columns: int, linear: Floats) -> Floats:
+    """Linear light (N, M[, 3]) of levels (N, columns M[, 3]), so many columns averaged."""
+    shine = np.asarray(cv2.LUT(level, linear), np.float32)
+    if columns == 1:
+        return shine
+    size = (level.shape[1] // columns, len(level))
+    return np.asarray(cv2.resize(shine, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _laser_light(shine: Floats, ground_px: float) -> Floats:
+    """Light of the laser's colour (M, N), of linear light (N, M[, 3]): that which varies least beside the line.
+
+    ground_px : where the ground begins, pixels from the middle.
+    """
+    if shine.ndim == 2:
+        return np.asarray(cv2.transpose(shine), np.float32)
+    ends = max(1, int(shine.shape[1] // 2 - ground_px))
+    beside = np.concatenate([part.mean(axis=1) for part in (shine[:, :ends], shine[:, -ends:])], axis=1)
+    rough = (beside - cv2.blur(beside, (1, _GROUND_ROWS), borderType=cv2.BORDER_REFLECT)).reshape(-1, 3)
+    weight = np.array([0, 1, 0], np.float32) if colourless(shine[::16]) else laser_weights(rough)
+    return np.asarray(cv2.transpose(cv2.transform(shine, weight[None])), np.float32)
+
+
+def _white(shine: Floats, light: Floats) -> NDArray[np.bool_]:
     """Pixels (M, N) with more blue and red than the laser has: bubbles, shells, edges of pale stones.
 
     Parameters
     ----------
-    level : (N, columns M, 3) pixels.
-    light : (M, N) green light above the ground.
+    shine : (N, M, 3) linear light.
+    light : (M, N) that of the laser's colour, above the ground.
     """
-    other = np.asarray(cv2.transform(cv2.LUT(level, linear), np.array([[0.5, 0, 0.5]], np.float32)), np.float32)
-    other = np.asarray(cv2.transpose(_averaged(other, columns)), np.float32)
+    other = np.asarray(cv2.transpose(cv2.transform(shine, _OTHER)), np.float32)
     usual = _usual(cv2.reduce(other, 0, cv2.REDUCE_AVG).ravel()).astype(np.float32)
     other -= usual
     middle = len(light) // 2
@@ -288,7 +313,7 @@ def _white(level: NDArray[np.uint8], light: Floats, columns: int, linear: Floats
     return white & (white[middle].mean() < 0.5)
 
 
-def _usual(height: Array) -> Array:
+def _usual(height: NDArray) -> Array:
     """Running median (N,) of heights, over 33 rows, to a sixteenth of a stop."""
     steps = np.clip(16 * np.log2(np.maximum(height, 1e-6)) + 255, 0, 255).astype(np.uint8)
     usual = np.repeat(cv2.medianBlur(steps[::4, None], 9).ravel(), 4)[: len(height)]

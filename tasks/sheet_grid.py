@@ -1,7 +1,8 @@
 """Inverse depth on both sheets of light at any pixel, interpolated between the nodes of a grid."""
 
+from collections.abc import Hashable
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -50,7 +51,7 @@ def _nodes(camera: Camera, light: Laser) -> tuple[float, NDArray[np.float32]]:
 
 def on_sheets(camera: Camera, light: Laser, u: Array, v: Array) -> OnSheets:
     """What pixels (N,), (N,) see on either sheet."""
-    cell, nodes = _nodes(camera, light)
+    cell, nodes = _nodes(cast(Hashable, camera), cast(Hashable, light))
     at = (np.stack([u, v]) / cell).astype(np.float32)[..., None]
     found = np.empty((len(u), 4), np.float32)
     for k in range(0, len(u), _MOST):
