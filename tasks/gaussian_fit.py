@@ -73,7 +73,7 @@ def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> F
     floor : variance that pixels have at least: that of rounding to levels.
     """
     half = len(light) // 2
-    x, mask = np.arange(-half, half + 1, dtype=np.float32)[:, None], used.astype(np.float32)
+    x, mask = np.arange(-half, half + 1, dtype=np.float32)[:, None], used.astype(np.float32, order="C")
     reach = min(int(1.2 * FIT * width) + 1, half)
     core = slice(half - reach, half + reach + 1)
     state, noise = _first(light[core], x[core], width), (floor, 0.0, 0.0)

@@ -348,7 +348,7 @@ def glow(image_bgr: NDArray[np.uint8], line_uv: Array, halfwidth_px: float, patc
     around = cv2.medianBlur(np.ascontiguousarray(ratio[::2, ::2]), min(width, height) // 10 | 1)
     around = cv2.resize(around, (width, height), interpolation=cv2.INTER_NEAREST)
     patch = cv2.connectedComponents((ratio > 1.15 * around).astype(np.uint8), connectivity=8)[1]
-    drawn = mask((height, width), (line_uv + 0.5) / scale - 0.5, halfwidth_px / scale[0])
+    drawn = mask((height, width), (line_uv[::2] + 0.5) / scale - 0.5, halfwidth_px / scale[0])
     touched = np.unique(patch[drawn])
     rows, columns = np.nonzero(np.isin(patch, touched[touched > 0]) & ~drawn)
     return (np.column_stack([columns, rows]).astype(np.float64) + 0.5) * scale - 0.5

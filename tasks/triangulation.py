@@ -236,13 +236,12 @@ def agreement(soundings: Soundings) -> Agreement | None:
     Near the crossing (within a tenth of the range, half of it on either side) each arm's depth is a straight line in
     its own direction; the two are compared where they cross in plan.
     """
-    ends = []
-    where = _crossing(soundings)
+    arms = [soundings.X_camera[soundings.arm == number] for number in (0, 1)]
+    where = _crossing(arms)
     if where is None:
         return None
-    reach = 0.1 * float(np.median(soundings.X_camera[:, 2]))
-    for number in (0, 1):
-        X = soundings.X_camera[soundings.arm == number]
+    ends, reach = [], 0.1 * float(np.median(arms[0][:, 2]))
+    for X in arms:
         along = X[:, 1] - where
         near = np.abs(along) < reach
         if min((near & (along < 0)).sum(), (near & (along > 0)).sum()) < _LEAST_NEAR:
@@ -251,14 +250,15 @@ def agreement(soundings: Soundings) -> Agreement | None:
     return Agreement(ends[1][0] - ends[0][0], float(np.hypot(ends[0][1], ends[1][1])))
 
 
-def _crossing(soundings: Soundings) -> float | None:
+def _crossing(arms: list[Array]) -> float | None:
     """Camera y, metres, at which both arms have the same x, if they do."""
-    lines = [soundings.X_camera[soundings.arm == number] for number in (0, 1)]
-    if min(map(len, lines)) < 2 * _LEAST_NEAR:
+    if min(map(len, arms)) < 2 * _LEAST_NEAR:
         return None
-    lines = [X[np.argsort(X[:, 1], kind="stable")] for X in lines]
-    y = np.linspace(max(X[0, 1] for X in lines), min(X[-1, 1] for X in lines), 400)
-    apart = np.interp(y, lines[0][:, 1], lines[0][:, 0]) - np.interp(y, lines[1][:, 1], lines[1][:, 0])
+    # every few points: where both arms pass is looked for no finer than in 400 places
+    few = [X[:: max(1, len(X) // 800)] for X in arms]
+    (x_a, y_a), (x_b, y_b) = (X[np.argsort(X[:, 1], kind="stable"), :2].T for X in few)
+    y = np.linspace(max(y_a[0], y_b[0]), min(y_a[-1], y_b[-1]), 400)
+    apart = np.interp(y, y_a, x_a) - np.interp(y, y_b, x_b)
     change = np.flatnonzero(np.sign(apart[1:]) != np.sign(apart[:-1]))
     return float(y[change[len(change) // 2]]) if len(change) and y[-1] > y[0] else None
 
