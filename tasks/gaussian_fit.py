@@ -28,7 +28,7 @@ _STEPS, _STEPS_CLIPPED = 2, 6
 _GROUND_ROWS, _WIDTH_ROWS, _NOISE_ROWS = 9, 41, 31
 # Bands of height, of the usual line's, in which the noise is measured, in so many profiles.
 _SHARES: Final = ((0.1, 0.35), (0.35, 0.65), (0.65, 1.0), (1.0, 2.0))
-_SAMPLES: Final = 160
+_SAMPLES: Final = 110
 _TINY: Final = np.float32(1e-15)
 
 

@@ -31,7 +31,9 @@ _WHITE: Final = 0.4
 _CLEARLY: Final = 6.0
 _OTHER: Final = np.array([[0.5, 0, 0.5]], np.float32)
 # The colour of the ground is learnt in so many rows, as it differs from the mean of some.
-_SAMPLES, _GROUND_ROWS = 600, 15
+_SAMPLES, _GROUND_ROWS = 350, 9
+# Nor, near an end of the line, one that has less than this share of its neighbours' brightness.
+_FADING: Final = 0.5
 # Nor one whose profile is so much less like a line than those around it.
 _MISFIT: Final = 4.0
 # How far from the line's rough place, in widths, it may be found.
@@ -252,7 +254,7 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     centre = np.round(rows.u).astype(np.intp)
     width = _typical_width(image, rows.v, centre, box_px, linear)
     # columns of a wide line are averaged: nothing is lost as long as they are narrower than the line
-    columns = 1 + 2 * int(width / 4)
+    columns = 1 + 2 * int(width / 3)
     half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
     level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
     green, shine = _green(level), _averaged_linear(level, columns, linear)
@@ -266,9 +268,23 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
     found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
-    strange = (found.height > _BRIGHT * _usual(found.height)) | (found.misfit > _MISFIT)
+    share = found.height / _usual(found.height)
+    strange = (share > _BRIGHT) | (found.misfit > _MISFIT)
+    strange |= (share < _FADING) & unclipped[half] & _near_end(rows, np.where(strange, np.nan, u), width)
     fit = _Fit(np.where(strange, np.nan, u), sigma, width, found.signal_to_noise)
     return _accepted(fit, rows, image.shape[1])
+
+
+def _near_end(rows: _Rows, u: Array, width: Array) -> NDArray[np.bool_]:
+    """Which points (N,) are within a width of where the line ends or jumps: light that it leaves there is half a line.
+
+    u : (N,) columns measured, NaN where none was.
+    """
+    broken = ~(np.abs(np.diff(u)) < 3 * width[1:]) | (np.diff(rows.v) != 1)
+    edge = np.concatenate([[True], broken, [True]])
+    reach = 2 * int(np.ceil(np.median(width))) + 1
+    near = cv2.dilate(edge.astype(np.uint8)[None], np.ones((1, reach), np.uint8))[0]
+    return (near[1:] | near[:-1]).astype(bool)
 
 
 def _averaged_linear(level: NDArray[np.uint8], columns: int, linear: Floats) -> Floats:
@@ -323,6 +339,8 @@ def _usual(height: NDArray) -> Array:
 
 def _all(pixels: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:
     """Which groups (N, M) of columns of (N, columns M) are true in every column."""
+    if columns == 1:
+        return pixels
     return np.logical_and.reduce([pixels[:, k::columns] for k in range(columns)])
 
 
