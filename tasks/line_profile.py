@@ -14,24 +14,21 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from . import gaussian_fit
-from .sheet_search import Arms, Piece, colourless, laser_weights, linear_light
+from .laser_colour import averaged_linear, laser_light, linear_light, running_median, white_pixels
+from .sheet_search import Arms, Piece
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
 _CLIPPED: Final = 250
+# Columns are not averaged where the crest is clipped in more than this share of the rows.
+_GLARING: Final = 0.1
 # Arms nearer than so many widths of the line are not told apart.
 APART: Final = 4.5
 # A point less sure than this share of the width is none; nor is one so many times as bright as its neighbours.
 _VAGUE: Final = 0.5
 _BRIGHT: Final = 3.0
-# Blue and red, as a share of the line's green, that the laser does not have; and over their scatter.
-_WHITE: Final = 0.4
-_CLEARLY: Final = 6.0
-_OTHER: Final = np.array([[0.5, 0, 0.5]], np.float32)
-# The colour of the ground is learnt in so many rows, as it differs from the mean of some.
-_SAMPLES, _GROUND_ROWS = 350, 9
 # Nor, near an end of the line, one that has less than this share of its neighbours' brightness.
 _FADING: Final = 0.5
 # Nor one whose profile is so much less like a line than those around it.
@@ -255,20 +252,24 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     width = _typical_width(image, rows.v, centre, box_px, linear)
     # columns of a wide line are averaged: nothing is lost as long as they are narrower than the line
     columns = 1 + 2 * int(width / 3)
+    crest = image[rows.v[::16], np.clip(centre[::16], 0, image.shape[1] - 1)]
+    if (crest.reshape(len(crest), -1).max(axis=1) >= _CLIPPED).mean() > _GLARING:
+        # the flanks of a clipped line are narrow
+        columns = 1
     half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
     level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
-    green, shine = _green(level), _averaged_linear(level, columns, linear)
+    green, shine = _green(level), averaged_linear(level, columns, linear)
     used, unclipped = _all(inside, columns).T, _all(green < _CLIPPED, columns).T
     used = used & ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns).T
-    light = _laser_light(shine, gaussian_fit.GROUND * width / columns)
+    light = laser_light(shine, gaussian_fit.GROUND * width / columns)
     light -= gaussian_fit.ground(light, used, width / columns)
     if image.ndim == 3:
-        used &= ~_white(shine, light)
+        used &= ~white_pixels(shine, light)
     typical = int(np.median(green[::7, ::3]))
     floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
     found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
-    share = found.height / _usual(found.height)
+    share = found.height / running_median(found.height)
     strange = (share > _BRIGHT) | (found.misfit > _MISFIT)
     strange |= (share < _FADING) & unclipped[half] & _near_end(rows, np.where(strange, np.nan, u), width)
     fit = _Fit(np.where(strange, np.nan, u), sigma, width, found.signal_to_noise)
@@ -285,56 +286,6 @@ def _near_end(rows: _Rows, u: Array, width: Array) -> NDArray[np.bool_]:
     reach = 2 * int(np.ceil(np.median(width))) + 1
     near = cv2.dilate(edge.astype(np.uint8)[None], np.ones((1, reach), np.uint8))[0]
     return (near[1:] | near[:-1]).astype(bool)
-
-
-def _averaged_linear(level: NDArray[np.uint8], columns: int, linear: Floats) -> Floats:
-    """Linear light (N, M[, 3]) of levels (N, columns M[, 3]), so many columns averaged."""
-    shine = np.asarray(cv2.LUT(level, linear), np.float32)
-    if columns == 1:
-        return shine
-    size = (level.shape[1] // columns, len(level))
-    return np.asarray(cv2.resize(shine, size, interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _laser_light(shine: Floats, ground_px: float) -> Floats:
-    """Light of the laser's colour (M, N), of linear light (N, M[, 3]): that which varies least beside the line.
-
-    ground_px : where the ground begins, pixels from the middle.
-    """
-    if shine.ndim == 2:
-        return np.asarray(cv2.transpose(shine), np.float32)
-    ends = max(1, int(shine.shape[1] // 2 - ground_px))
-    some = shine[:: max(1, len(shine) // _SAMPLES)]
-    beside = np.concatenate([cv2.reduce(part, 1, cv2.REDUCE_AVG) for part in (some[:, :ends], some[:, -ends:])], axis=1)
-    rough = (beside - cv2.blur(beside, (1, _GROUND_ROWS), borderType=cv2.BORDER_REFLECT)).reshape(-1, 3)
-    weight = np.array([0, 1, 0], np.float32) if colourless(shine[::16]) else laser_weights(rough)
-    return np.asarray(cv2.transpose(cv2.transform(shine, weight[None])), np.float32)
-
-
-def _white(shine: Floats, light: Floats) -> NDArray[np.bool_]:
-    """Pixels (M, N) with more blue and red than the laser has: bubbles, shells, edges of pale stones.
-
-    Parameters
-    ----------
-    shine : (N, M, 3) linear light.
-    light : (M, N) that of the laser's colour, above the ground.
-    """
-    other = np.asarray(cv2.transpose(cv2.transform(shine, _OTHER)), np.float32)
-    usual = _usual(cv2.reduce(other, 0, cv2.REDUCE_AVG).ravel()).astype(np.float32)
-    other -= usual
-    middle = len(light) // 2
-    height = _usual(light[middle - 1 : middle + 2].max(axis=0)).astype(np.float32)
-    scatter = 1.4826 * float(np.median(np.abs(other[::3, ::16])))
-    white = other > np.maximum(_WHITE * height, np.float32(_CLEARLY * scatter))
-    # where most of the line is white the image has no colour
-    return white & (white[middle].mean() < 0.5)
-
-
-def _usual(height: NDArray) -> Array:
-    """Running median (N,) of heights, over 33 rows, to a sixteenth of a stop."""
-    steps = np.clip(16 * np.log2(np.maximum(height, 1e-6)) + 255, 0, 255).astype(np.uint8)
-    usual = np.repeat(cv2.medianBlur(steps[::4, None], 9).ravel(), 4)[: len(height)]
-    return 2 ** ((usual.astype(float) - 255) / 16)
 
 
 def _all(pixels: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..schemas.calibration import Camera, Laser
 from ..schemas.parameters import LaserParameters
+from .laser_colour import evidence
 from .sheet_grid import on_sheets
 
 Array = NDArray[np.float64]
@@ -24,14 +25,8 @@ Indices = NDArray[np.intp]
 
 _WIDTH_PX, _ROWS = 600, 300
 _SMALLEST_PX: Final = 100
-# What the laser adds to blue, green and red, of linear light; filters are never as narrow as that of the laser.
-_LASER_BGR: Final = np.array([0.2, 1.0, 0.15])
-# Noise, of that in green, that any mixture of colours is thought to have at least.
-_COLOUR_DOUBT: Final = 0.003
-_GREY: Final = 0.02
 # Widths of the box that sums up the line, pixels of the reduced image.
 _BOXES: Final = (1, 3, 5, 9, 15)
-_CLIPPED: Final = 252
 # Neighbours on a chain: so many rows apart at most, and so many columns apart for the noise; and so much slope.
 _REACH_ROWS: Final = 3
 _NOISE_PX: Final = 1.0
@@ -188,52 +183,6 @@ def _both(
             own = found[number]
             found[number] = _Arm([m[~lost[m]] if (~lost[m]).sum() > 2 else m for m in own.members], own.gains)
     return found
-
-
-def evidence(image: NDArray[np.uint8], gamma: float) -> Floats:
-    """Light of the laser's colour (h, w), linear, 1 where it fills the sensor: the colour that texture least has.
-
-    Channels are weighed by the scatter, texture and noise together, of the image from pixel to pixel.
-    """
-    light = np.asarray(cv2.LUT(image, linear_light(gamma)), np.float32)
-    if image.ndim == 2:
-        return light
-    some = np.ascontiguousarray(light[2::20])
-    rough = (some - cv2.blur(some, (15, 1)))[:, ::3].reshape(-1, 3)
-    if colourless(some):
-        return np.asarray(cv2.extractChannel(light, 1), np.float32)
-    weight = laser_weights(rough)
-    seen: Floats = np.asarray(cv2.transform(light, weight[None]), np.float32)
-    if (image[::3, :, 1] >= _CLIPPED).mean() > 1e-4:
-        # the core of an overexposed line is white between green edges
-        closed = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((1, image.shape[1] // 40 | 1), np.uint8))
-        np.copyto(seen, closed, where=image[..., 1] >= _CLIPPED)
-    return seen
-
-
-def colourless(light: Floats) -> bool:
-    """Whether all channels of some linear light (..., 3) are the same: a grey image in colour."""
-    return bool(np.abs(light[..., ::2] - light[..., 1:2]).mean() <= _GREY * light.mean())
-
-
-def laser_weights(rough: NDArray) -> Floats:
-    """Weights (3,) of blue, green and red that give the laser most over a scatter, and 1 for its own light.
-
-    C^-1 s, with C the scatter's covariance and s the laser's colour.
-
-    rough : (N, 3) samples of the scatter, around zero.
-    """
-    rough = np.ascontiguousarray(rough.T)
-    limit = np.asarray(4.5 * np.median(np.abs(rough), axis=1, keepdims=True) + 1e-5, np.float32)
-    rough = np.clip(rough, -limit, limit)
-    scatter = (rough @ rough.T / rough.shape[1]).astype(float)
-    weight = np.linalg.solve(scatter + _COLOUR_DOUBT * scatter[1, 1] * np.eye(3), _LASER_BGR)
-    return (weight / (weight @ _LASER_BGR)).astype(np.float32)
-
-
-def linear_light(gamma: float) -> Floats:
-    """Linear light (256,), 0..1, of the levels of an image."""
-    return ((np.arange(256) / 255) ** gamma).astype(np.float32)
 
 
 def _lobes(seen: Floats, box: int) -> tuple[Floats, Floats]:
