@@ -22,8 +22,8 @@ Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
 _CLIPPED: Final = 250
-# Columns are not averaged where the crest is clipped in more than this share of the rows.
-_GLARING: Final = 0.1
+# Columns are not averaged where the crest is clipped in more than this share of rows.
+_GLARING: Final = 0.5
 # Arms nearer than so many widths of the line are not told apart.
 APART: Final = 4.5
 # A point less sure than this share of the width is none; nor is one so many times as bright as its neighbours.
