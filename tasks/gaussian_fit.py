@@ -2,7 +2,8 @@
 
 Least squares with weights from each pixel's variance is the maximum likelihood; a line's place is then known to the
 bound of Cramér and Rao. The noise is learnt from the residuals: it grows with light (photons) and with its square
-(speckle). Each profile has its own place and height; width and noise are shared between neighbours.
+(speckle). Each profile has its own place and height; width and noise are shared between neighbours. Profiles stand
+side by side as columns, so that every sum over a profile runs over all of them at once.
 """
 
 from typing import Final, NamedTuple
@@ -22,12 +23,12 @@ WINDOW: Final = 4.5
 GROUND: Final = 3.2
 FIT: Final = 3.0
 # Where the crest is clipped, height and width are told by the flanks, and slowly.
-_STEPS, _STEPS_CLIPPED = 3, 7
+_STEPS, _STEPS_CLIPPED = 2, 6
 # Rows over which ground, width and noise are averaged.
 _GROUND_ROWS, _WIDTH_ROWS, _NOISE_ROWS = 9, 41, 31
-# Bands of height, of the usual line's, in which the noise is measured, in so many rows.
+# Bands of height, of the usual line's, in which the noise is measured, in so many profiles.
 _SHARES: Final = ((0.1, 0.35), (0.35, 0.65), (0.65, 1.0), (1.0, 2.0))
-_SAMPLE_ROWS: Final = 500
+_SAMPLES: Final = 110
 _TINY: Final = np.float32(1e-15)
 
 
@@ -53,14 +54,12 @@ class Fit(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Of each profile (N, 1): place, width, height; residuals and Gaussians (N, M); normal equations."""
+    """Of each profile (N,): place, width, height; normal equations of height and place."""
 
-    place: Floats
-    width: Floats
-    height: Floats
-    residual: Floats
-    gaussian: Floats
-    normals: tuple[Floats, Floats, Floats]
+    place: NDArray
+    width: NDArray
+    height: NDArray
+    normals: tuple[NDArray, NDArray, NDArray]
 
 
 def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> Fit:
@@ -68,97 +67,129 @@ def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> F
 
     Parameters
     ----------
-    light : (N, M) profiles, M odd; neighbours in N are neighbours on the line.
-    used : (N, M) pixels to use.
+    light : (M, N) profiles, M odd; neighbours in N are neighbours on the line.
+    used : (M, N) pixels to use.
     width : standard deviation of most, pixels.
     floor : variance that pixels have at least: that of rounding to levels.
     """
-    half = light.shape[1] // 2
-    x, mask = np.arange(-half, half + 1, dtype=np.float32), used.astype(np.float32)
-    zero = np.zeros((len(light), 1), np.float32)
-    state = _State(zero, zero + np.float32(width), zero, light, light, (zero, zero, zero))
-    noise = (floor, 0.0, 0.0)
-    steps = _STEPS if used[:, half].mean() > 0.5 else _STEPS_CLIPPED
+    half = len(light) // 2
+    x, mask = np.arange(-half, half + 1, dtype=np.float32)[:, None], used.astype(np.float32, order="C")
+    reach = min(int(1.2 * FIT * width) + 1, half)
+    core = slice(half - reach, half + reach + 1)
+    state, noise = _first(light[core], x[core], width), (floor, 0.0, 0.0)
+    steps = _STEPS if used[half].mean() > 0.5 else _STEPS_CLIPPED
     for k in range(steps):
-        state = _improved(state, light, mask, x, noise, last=k == steps - 1)
+        state = _improved(state, light[core], mask[core], x[core], noise, last=k == steps - 1)
         if k == steps - 2:
-            noise = _noise(state, mask, x, floor)
-    level, misfit = _noise_level(state, mask, x, noise)
+            noise = _noise(state, light, mask, x, floor)
+    level, misfit = _noise_level(state, light, mask, x, noise)
     gg, gd, dd = state.normals
     determinant = np.maximum(gg * dd - gd**2, _TINY)
     snr = state.height * np.sqrt(determinant / np.maximum(dd, _TINY)) / level
     sigma = level * np.sqrt(gg / determinant) / np.maximum(state.height, 1e-9)
-    return Fit(
-        *(np.asarray(field, float).ravel() for field in (state.place, sigma, state.width, snr, state.height, misfit))
-    )
+    return Fit(*(np.asarray(part, float) for part in (state.place, sigma, state.width, snr, state.height, misfit)))
 
 
 def ground(light: Floats, used: NDArray[np.bool_], width: float) -> Floats:
-    """Straight lines (N, M) through what lies to both sides of each profile (N, M), averaged over some rows."""
-    half = light.shape[1] // 2
+    """Straight lines (M, N) through what lies to both sides of each profile (M, N), averaged over some of them."""
+    half = len(light) // 2
     x = np.arange(-half, half + 1, dtype=np.float32)
     mean, place = [], []
     for side in (x < -GROUND * width, x > GROUND * width):
-        part, seen = np.ascontiguousarray(light[:, side]), used[:, side].astype(np.float32)
-        count, total = (_along(values, _GROUND_ROWS) for values in (_dot(seen, seen), _dot(part, seen)))
+        part = slice(*np.flatnonzero(side)[[0, -1]] + [0, 1])
+        seen = used[part].astype(np.float32)
+        count, total = _along(seen.sum(axis=0), _GROUND_ROWS), _along(_dot(light[part], seen), _GROUND_ROWS)
         mean.append(np.where(count > 1e-3, total / np.maximum(count, 1e-3), np.nan))
         place.append(float(x[side].mean()))
     left, right = (np.where(np.isnan(a), np.where(np.isnan(b), 0, b), a) for a, b in (mean, mean[::-1]))
-    return (left + (right - left) * ((x - place[0]) / (place[1] - place[0]))).astype(np.float32)
+    share = (x[:, None] - np.float32(place[0])) / np.float32(place[1] - place[0])
+    return np.asarray(left + (right - left) * share, np.float32)
 
 
-def _dot(a: NDArray, b: NDArray) -> Floats:
-    """Sums (N, 1) over the rows of a * b."""
-    return np.asarray(np.einsum("ij,ij->i", a, b), np.float32)[:, None]
+def _dot(a: NDArray, b: NDArray) -> NDArray:
+    """Sums (N,) over the profiles of a * b, (M, N) each."""
+    return np.einsum("ij,ij->j", a, b)
 
 
 def _along(values: NDArray, rows: int) -> Floats:
-    """Means (N, 1) of so many neighbours."""
+    """Means (N,) of so many neighbours."""
     smooth = cv2.blur(values.reshape(1, -1), (rows, 1), borderType=cv2.BORDER_REFLECT)
-    return np.asarray(smooth, np.float32).reshape(-1, 1)
+    return np.asarray(smooth, np.float32).ravel()
+
+
+def _first(light: Floats, x: Floats, width: float) -> _State:
+    """The first step from the middle, all pixels used: the same weights for all profiles."""
+    t = x / np.float32(width)
+    g = np.exp(np.float32(-0.5) * t * t) * (np.abs(t) < FIT)
+    gg, dd, ss = ((g * g * t**power).sum(axis=0) for power in (0, 2, 4))
+    gp, dp, sp = np.hstack([g, g * t, g * t * t]).T @ light
+    height = np.maximum(gp / gg, np.float32(1e-7))
+    sums = _Sums(gg, np.zeros_like(gg), dd, ss, gp, dp, sp)
+    start = np.full(light.shape[1], np.float32(width))
+    step = np.clip(dp / dd / height, -1, 1)
+    place = np.clip(start * step, x[0], x[-1])
+    return _State(place, _wider(start, height, sums), height, (gp, gp, gp))
+
+
+class _Sums(NamedTuple):
+    """Over each profile (N,), t the distance from the place in widths: of w g^2 t^k, k 0, 1, 2, 4; w g light t^k."""
+
+    a0: NDArray
+    a1: NDArray
+    a2: NDArray
+    a4: NDArray
+    b0: Floats
+    b1: Floats
+    b2: Floats
 
 
 def _improved(state: _State, light: Floats, mask: Floats, x: Floats, noise: Noise, last: bool) -> _State:
     """One step of Gauss and Newton's for place, height and, but in the last, width."""
-    t = (x - state.place) / state.width
-    g = np.exp(-0.5 * t * t)
-    weight = mask * (np.abs(t) < FIT) / _variance(state.height, g, noise)
-    slope = g * t / state.width
-    wg, ws = weight * g, weight * slope
-    gg, gd, dd, gp, dp = _dot(wg, g), _dot(wg, slope), _dot(ws, slope), _dot(wg, light), _dot(ws, light)
-    determinant = np.maximum(gg * dd - gd * gd, _TINY)
-    height = np.maximum((dd * gp - gd * dp) / determinant, 1e-7)
-    step = (gg * dp - gd * gp) / determinant / height
-    residual = light - height * g
     width = state.width
-    if not last:
-        width = _wider(width, residual, height, (t, g, wg, gg))
-    place = state.place + np.clip(step, -state.width, state.width)
-    place = np.asarray(np.clip(place, x[0], x[-1]), np.float32)
-    return _State(place, width, height, residual, g, (gg, gd, dd))
+    t, square, g = _gaussian(state, x)
+    wg = mask * (square < np.float32(FIT**2))
+    wg *= g
+    if noise[1] or noise[2]:
+        wg /= _variance(state.height, g, noise)
+    a, b = wg * g, wg * light
+    a2, b1 = a * square, b * t
+    bent = (_dot(a2, square), _dot(b1, t)) if not last else (t[0], t[0])
+    sums = _Sums(a.sum(axis=0), _dot(a, t), a2.sum(axis=0), bent[0], b.sum(axis=0), b1.sum(axis=0), bent[1])
+    determinant = np.maximum(sums.a0 * sums.a2 - sums.a1 * sums.a1, _TINY)
+    height = np.maximum((sums.a2 * sums.b0 - sums.a1 * sums.b1) / determinant, np.float32(1e-7))
+    step = np.clip((sums.a0 * sums.b1 - sums.a1 * sums.b0) / determinant / height, -1, 1)
+    place = np.clip(state.place + width * step, x[0], x[-1])
+    beside = np.float32(noise[0])
+    normals = sums.a0 / beside, sums.a1 / width / beside, sums.a2 / width**2 / beside
+    return _State(place, width if last else _wider(width, height, sums), height, normals)
 
 
-def _wider(width: Floats, residual: Floats, height: Floats, shape: tuple[Floats, Floats, Floats, Floats]) -> Floats:
-    """Widths that fit better, each for some rows together."""
-    t, g, wg, gg = shape
+def _gaussian(state: _State, x: Floats) -> tuple[NDArray, NDArray, NDArray]:
+    """Distance from the place in widths (M, N), its square, and the Gaussian."""
+    t = (x - state.place) * (1 / state.width)
     square = t * t
-    wgs = wg * square
+    return t, square, np.asarray(cv2.exp(np.float32(-0.5) * square), np.float32)
+
+
+def _wider(width: Floats, height: Floats, sums: _Sums) -> Floats:
+    """Widths that fit better, each for some profiles together."""
     # a wider line looks higher, too: what of its change is like a change of height does not count
-    alike = _dot(wgs, g) / np.maximum(gg, _TINY)
-    up = height * (_dot(wgs, residual) - alike * _dot(wg, residual)) / width
-    down = height**2 * (_dot(wgs, g * square) - alike * _dot(wgs, g)) / width**2
-    up, down = (_along(part, _WIDTH_ROWS).astype(np.float64) for part in (up, down))
-    change = np.clip(up / np.maximum(down, 1e-9), -0.2 * width, 0.2 * width)
-    return np.maximum(width + change.astype(np.float32), np.float32(0.5))
+    alike = sums.a2 / np.maximum(sums.a0, _TINY)
+    up = height * (sums.b2 - height * sums.a2 - alike * (sums.b0 - height * sums.a0)) / width
+    down = height**2 * (sums.a4 - alike * sums.a2) / width**2
+    up, down = (_along(part, _WIDTH_ROWS) for part in (up, down))
+    change = np.clip(up / np.maximum(down, np.float32(1e-12)), -0.2 * width, 0.2 * width)
+    return np.maximum(width + change, np.float32(0.5))
 
 
-def _noise(state: _State, mask: Floats, x: Floats, floor: float) -> Noise:
-    """What pixels' variances are beside the line and on it, from the residuals of some rows."""
-    some = slice(None, None, max(1, len(mask) // _SAMPLE_ROWS))
-    seen = mask[some] > 0
-    share = (_share(state.height)[some] * state.gaussian[some])[seen]
-    residual = np.abs(state.residual[some][seen])
-    outer = (np.abs(x - state.place[some]) > GROUND * state.width[some])[seen]
+def _noise(state: _State, light: Floats, mask: Floats, x: Floats, floor: float) -> Noise:
+    """What pixels' variances are beside the line and on it, from the residuals of some profiles."""
+    some = slice(None, None, max(1, mask.shape[1] // _SAMPLES))
+    part = _State(state.place[some], state.width[some], state.height[some], state.normals)
+    seen, (_, square, gaussian) = mask[:, some] > 0, _gaussian(part, x)
+    share = (_share(state.height)[some] * gaussian)[seen]
+    residual = np.abs(light[:, some] - part.height * gaussian)[seen]
+    outer = (square > GROUND**2)[seen]
     if outer.sum() < 20:
         return floor, 0.0, 0.0
     size, places = [residual[outer]], [0.0]
@@ -178,24 +209,23 @@ def _noise(state: _State, mask: Floats, x: Floats, floor: float) -> Noise:
     return float(beside), float(linear / beside), float(square / beside)
 
 
-def _share(height: Floats) -> Floats:
-    """Height of each line (N, 1) over that of most."""
-    return np.minimum(height / max(float(np.median(height)), 1e-9), 4)
+def _share(height: NDArray) -> NDArray:
+    """Height of each line (N,) over that of most."""
+    return np.minimum(height / np.float32(max(float(np.median(height)), 1e-9)), np.float32(4))
 
 
-def _variance(height: Floats, gaussian: Floats, noise: Noise) -> NDArray | np.float32:
-    """Of each pixel (N, M)."""
-    beside, linear, square = (np.float32(part) for part in noise)
-    if linear == 0 and square == 0:
-        return beside
+def _variance(height: NDArray, gaussian: NDArray, noise: Noise) -> NDArray:
+    """Of each pixel (M, N), over that beside the line."""
+    linear, square = np.float32(noise[1]), np.float32(noise[2])
     on = _share(height) * gaussian
-    return beside * (1 + on * (linear + square * on))
+    return np.float32(1) + on * (linear + square * on)
 
 
-def _noise_level(state: _State, mask: Floats, x: Floats, noise: Noise) -> tuple[NDArray, NDArray]:
-    """Scatter of the residuals (N, 1) over what was expected, of some rows together; its square in each row to that."""
-    inside = mask * (np.abs(x - state.place) < WINDOW * state.width)
-    squares = state.residual**2 / _variance(state.height, state.gaussian, noise)
-    up, down = _dot(np.minimum(squares, 16), inside), np.maximum(_dot(inside, inside) - 2, 0.5)
-    around = np.clip(_along(up, _NOISE_ROWS) / _along(down, _NOISE_ROWS), 0.3, 30)
+def _noise_level(state: _State, light: Floats, mask: Floats, x: Floats, noise: Noise) -> tuple[NDArray, NDArray]:
+    """Scatter of the residuals (N,) over what was expected, of some rows together; its square in each row to that."""
+    gaussian = _gaussian(state, x)[2]
+    residual = light - state.height * gaussian
+    squares = residual * residual / (np.float32(noise[0]) * _variance(state.height, gaussian, noise))
+    up, down = _dot(np.minimum(squares, np.float32(16)), mask), np.maximum(mask.sum(axis=0) - 2, np.float32(0.5))
+    around = np.clip(_along(up, _NOISE_ROWS) / _along(down, _NOISE_ROWS), np.float32(0.3), np.float32(30))
     return np.sqrt(around), up / down / around

@@ -323,22 +323,32 @@ def mask(shape: tuple[int, int], uv: Array, halfwidth_px: float) -> NDArray[np.b
     return drawn.astype(bool)
 
 
-def glow(image_bgr: NDArray[np.uint8], line_uv: Array, halfwidth_px: float, step_px: int) -> Array:
+def glow(image_bgr: NDArray[np.uint8], line_uv: Array, halfwidth_px: float, patch_px: tuple[float, float]) -> Array:
     """Pixels (M, 2) of laser light that mask() would leave: faint or running along the rows, where no row has a peak.
 
     Patches greener, by 15 %, than what is around them, that hang together with the line found (line_uv).
+
+    Parameters
+    ----------
+    image_bgr : (H, W, 3) or (H, W).
+    line_uv : (N, 2) pixels of the image along the line found.
+    halfwidth_px : how far its light reaches to each side along a row, columns of the image.
+    patch_px : columns and rows that are averaged before colour is judged.
     """
     if image_bgr.ndim == 2 or not len(line_uv):
         return np.zeros((0, 2))
-    scale = 3 * step_px
-    size = (image_bgr.shape[1] // scale, image_bgr.shape[0] // scale)
-    small = cv2.resize(image_bgr[: size[1] * scale, : size[0] * scale], size, interpolation=cv2.INTER_AREA)
+    scale = np.array(patch_px)
+    width, height = (np.array(image_bgr.shape[1::-1]) / scale).astype(int).tolist()
+    columns, rows = np.round(scale * (width, height)).astype(int)
+    small = cv2.resize(image_bgr[:rows, :columns], (width, height), interpolation=cv2.INTER_AREA)
     # eight grey levels keep the noise of a dark image from counting as colour; 64 makes no colour a quarter of 255
     blue, green, red = (small[..., k].astype(np.float32) + 8 for k in range(3))
-    ratio = np.clip(128 * green / (blue + red), 0, 255)
-    around = cv2.medianBlur(ratio.astype(np.uint8), min(size) // 5 | 1)
+    ratio = np.clip(128 * green / (blue + red), 0, 255).astype(np.uint8)
+    # of every other patch: the median of a fifth of the image
+    around = cv2.medianBlur(np.ascontiguousarray(ratio[::2, ::2]), min(width, height) // 10 | 1)
+    around = cv2.resize(around, (width, height), interpolation=cv2.INTER_NEAREST)
     patch = cv2.connectedComponents((ratio > 1.15 * around).astype(np.uint8), connectivity=8)[1]
-    drawn = mask((size[1], size[0]), (line_uv + 0.5) / scale - 0.5, halfwidth_px / scale)
+    drawn = mask((height, width), (line_uv[::2] + 0.5) / scale - 0.5, halfwidth_px / scale[0])
     touched = np.unique(patch[drawn])
     rows, columns = np.nonzero(np.isin(patch, touched[touched > 0]) & ~drawn)
     return (np.column_stack([columns, rows]).astype(np.float64) + 0.5) * scale - 0.5

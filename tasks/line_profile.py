@@ -14,22 +14,23 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from . import gaussian_fit
-from .sheet_search import Arms, Piece, linear_light
+from .laser_colour import averaged_linear, laser_light, linear_light, running_median, white_pixels
+from .sheet_search import Arms, Piece
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
 _CLIPPED: Final = 250
+# Columns are not averaged where the crest is clipped in more than this share of rows.
+_GLARING: Final = 0.5
 # Arms nearer than so many widths of the line are not told apart.
 APART: Final = 4.5
 # A point less sure than this share of the width is none; nor is one so many times as bright as its neighbours.
 _VAGUE: Final = 0.5
 _BRIGHT: Final = 3.0
-# Nor, if it stands out clearly, one with this share of the blue and red of white light.
-_WHITE: Final = 0.7
-_COLOUR_SNR: Final = 8.0
-_COLOUR_ROWS: Final = 21
+# Nor, near an end of the line, one that has less than this share of its neighbours' brightness.
+_FADING: Final = 0.5
 # Nor one whose profile is so much less like a line than those around it.
 _MISFIT: Final = 4.0
 # How far from the line's rough place, in widths, it may be found.
@@ -174,22 +175,25 @@ def _column_at(rows: _Rows, v: Indices) -> Array:
 def _strip(
     image: NDArray[np.uint8], v: Indices, centre: Indices, half: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Green levels (N, 2 half + 1) around a column in each row, and which of them are in the image.
+    """Pixels (N, 2 half + 1[, 3]) around a column in each row, and which of them are in the image.
 
     Those that are not repeat the row's last pixel.
     """
-    width, size = image.shape[1], 2 * half + 1
-    green = image[..., 1] if image.ndim == 3 else image
-    step = green.strides[1]
+    width, size, depth = image.shape[1], 2 * half + 1, image.shape[2] if image.ndim == 3 else 1
     # windows of consecutive pixels, of any start: the rows of an image lie one behind the other
-    windows = as_strided(green, (green.size - size + 1, size), (step, step), writeable=False)
-    level = windows[np.clip(v * width + centre - half, 0, len(windows) - 1)]
-    inside = np.ones(level.shape, bool)
+    windows = as_strided(image, (image.size - size * depth + 1, size * depth), (1, 1), writeable=False)
+    level = windows[np.clip((v * width + centre - half) * depth, 0, len(windows) - 1)]
+    level = level.reshape(len(v), size, *image.shape[2:])
+    inside = np.ones(level.shape[:2], bool)
     cut = np.flatnonzero((centre < half) | (centre >= width - half))
     column = centre[cut, None] + np.arange(-half, half + 1)
     inside[cut] = (column >= 0) & (column < width)
-    level[cut] = green[v[cut, None], np.clip(column, 0, width - 1)]
+    level[cut] = image[v[cut, None], np.clip(column, 0, width - 1)]
     return level, inside
+
+
+def _green(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return image if image.ndim == 2 else np.asarray(cv2.extractChannel(image, 1), np.uint8)
 
 
 def _centred(image: NDArray[np.uint8], rows: _Rows, box_px: float, factor: int) -> _Rows:
@@ -200,7 +204,7 @@ def _centred(image: NDArray[np.uint8], rows: _Rows, box_px: float, factor: int) 
     reach, wide = factor // columns + 1, int(np.ceil(1.5 * box_px / columns)) + 1
     v, centre = rows.v[::every], np.round(rows.u[::every]).astype(np.intp)
     half = reach + wide
-    level = _averaged(_strip(image, v, centre, half * columns + columns // 2)[0], columns)
+    level = _averaged(_green(_strip(image, v, centre, half * columns + columns // 2)[0]), columns)
     sigma = max(0.4 * box_px / columns, 0.8)
     narrow = cv2.GaussianBlur(cv2.blur(level, (1, 7 if every == 1 else 5)), (2 * int(2.5 * sigma) + 1, 1), sigma)
     broad = cv2.blur(narrow, (2 * wide + 1, 1))
@@ -226,8 +230,8 @@ def _averaged(values: NDArray, columns: int) -> Floats:
 
 def _typical_width(image: NDArray[np.uint8], v: Indices, centre: Indices, box_px: float, linear: Floats) -> float:
     """Standard deviation in pixels of the median profile of rows in which the line's column is known to a pixel."""
-    half, some = int(np.ceil(1.7 * box_px)) + 2, slice(None, None, max(1, len(v) // 300))
-    light = linear[_strip(image, v[some], centre[some], half)[0]]
+    half, some = int(np.ceil(1.7 * box_px)) + 2, slice(None, None, max(1, len(v) // 80))
+    light = linear[_green(_strip(image, v[some], centre[some], half)[0])]
     ends = max(1, half // 4)
     ground = 0.5 * (light[:, :ends].mean(axis=1) + light[:, -ends:].mean(axis=1))
     profile = np.median(light - ground[:, None], axis=0).astype(float)
@@ -247,51 +251,47 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     centre = np.round(rows.u).astype(np.intp)
     width = _typical_width(image, rows.v, centre, box_px, linear)
     # columns of a wide line are averaged: nothing is lost as long as they are narrower than the line
-    columns = 1 + 2 * int(width / 4)
+    columns = 1 + 2 * int(width / 3)
+    crest = image[rows.v[::16], np.clip(centre[::16], 0, image.shape[1] - 1)]
+    if (crest.reshape(len(crest), -1).max(axis=1) >= _CLIPPED).mean() > _GLARING:
+        # the flanks of a clipped line are narrow
+        columns = 1
     half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
     level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
-    light = _averaged(np.asarray(cv2.LUT(level, linear), np.float32), columns)
-    used, unclipped = _all(inside, columns), _all(level < _CLIPPED, columns)
-    used &= ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns)
+    green, shine = _green(level), averaged_linear(level, columns, linear)
+    used, unclipped = _all(inside, columns).T, _all(green < _CLIPPED, columns).T
+    used = used & ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns).T
+    light = laser_light(shine, gaussian_fit.GROUND * width / columns)
     light -= gaussian_fit.ground(light, used, width / columns)
-    typical = int(np.median(level[::7, ::3]))
+    if image.ndim == 3:
+        used &= ~white_pixels(shine, light)
+    typical = int(np.median(green[::7, ::3]))
     floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
     found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
-    fit = _Fit(u, sigma, width, found.signal_to_noise)
-    if image.ndim == 3:
-        white = _white(image, rows.v, fit, linear) & unclipped[:, half - 1 : half + 2].all(axis=1)
-        fit = fit._replace(u=np.where(white, np.nan, u))
-    strange = (found.height > _BRIGHT * _usual(found.height)) | (found.misfit > _MISFIT)
-    return _accepted(fit._replace(u=np.where(strange, np.nan, fit.u)), rows, image.shape[1])
+    share = found.height / running_median(found.height)
+    strange = (share > _BRIGHT) | (found.misfit > _MISFIT)
+    strange |= (share < _FADING) & unclipped[half] & _near_end(rows, np.where(strange, np.nan, u), width)
+    fit = _Fit(np.where(strange, np.nan, u), sigma, width, found.signal_to_noise)
+    return _accepted(fit, rows, image.shape[1])
 
 
-def _white(image: NDArray[np.uint8], v: Indices, fit: _Fit, linear: Floats) -> NDArray[np.bool_]:
-    """Which points (N,) add to blue and red what white light would: bubbles, shells. Clipped ones cannot be told."""
-    side = np.round(gaussian_fit.GROUND * fit.width)[:, None] * np.array([-1.0, 0.0, 1.0])
-    column = np.clip(np.round(fit.u)[:, None] + side, 0, image.shape[1] - 1).astype(np.intp)
-    level = image[v[:, None], column]
-    light = linear[level]
-    beside = 0.5 * (light[:, 0] + light[:, 2])
-    added = light[:, 1] - beside
-    around = cv2.blur(beside, (1, _COLOUR_ROWS), borderType=cv2.BORDER_REFLECT)
-    expected = (around[:, 0] + around[:, 2]) * added[:, 1]
-    # without light of another source beside the line there is nothing to compare with
-    told = (fit.signal_to_noise > _COLOUR_SNR) & (around[:, 1] > np.maximum(0.02, 0.1 * added[:, 1]))
-    white = told & ((added[:, 0] + added[:, 2]) * around[:, 1] > _WHITE * expected)
-    # where most of the line is white the image has no colour
-    return white & (white.mean() < 0.5)
+def _near_end(rows: _Rows, u: Array, width: Array) -> NDArray[np.bool_]:
+    """Which points (N,) are within a width of where the line ends or jumps: light that it leaves there is half a line.
 
-
-def _usual(height: Array) -> Array:
-    """Running median (N,) of heights, over 33 rows, to a sixteenth of a stop."""
-    steps = np.clip(16 * np.log2(np.maximum(height, 1e-6)) + 255, 0, 255).astype(np.uint8)
-    usual = np.repeat(cv2.medianBlur(steps[::4, None], 9).ravel(), 4)[: len(height)]
-    return 2 ** ((usual.astype(float) - 255) / 16)
+    u : (N,) columns measured, NaN where none was.
+    """
+    broken = ~(np.abs(np.diff(u)) < 3 * width[1:]) | (np.diff(rows.v) != 1)
+    edge = np.concatenate([[True], broken, [True]])
+    reach = 2 * int(np.ceil(np.median(width))) + 1
+    near = cv2.dilate(edge.astype(np.uint8)[None], np.ones((1, reach), np.uint8))[0]
+    return (near[1:] | near[:-1]).astype(bool)
 
 
 def _all(pixels: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:
     """Which groups (N, M) of columns of (N, columns M) are true in every column."""
+    if columns == 1:
+        return pixels
     return np.logical_and.reduce([pixels[:, k::columns] for k in range(columns)])
 
 
@@ -327,5 +327,7 @@ def _scatter_over_sigma(line: Line) -> float:
         return 1.0
     off = np.sum([w * u[part] for w, part in zip(weight, at, strict=True)], axis=0)
     expected = np.sum([w**2 * variance[part] for w, part in zip(weight, at, strict=True)], axis=0)
-    # median of a squared normal variable: 0.4549 of its variance
-    return float(np.clip(np.sqrt(np.median(off[even] ** 2 / expected[even]) / 0.4549), 0.7, 20))
+    square = off[even] ** 2 / expected[even]
+    # median of a squared normal variable: 0.4549 of its variance; speckle has longer tails, which count up to 3 sigma
+    usual = float(np.median(square)) / 0.4549
+    return float(np.clip(np.sqrt(np.minimum(square, 9 * usual).mean() / 0.991), 0.7, 20))

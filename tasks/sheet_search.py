@@ -16,34 +16,33 @@ from scipy.sparse.csgraph import connected_components
 
 from ..schemas.calibration import Camera, Laser
 from ..schemas.parameters import LaserParameters
-from .camera import rays
+from .laser_colour import evidence
+from .sheet_grid import on_sheets
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
-_WIDTH_PX: Final = 600
+_WIDTH_PX, _ROWS = 600, 300
 _SMALLEST_PX: Final = 100
-# What the laser adds to blue, green and red, of linear light; filters are never as narrow as that of the laser.
-_LASER_BGR: Final = np.array([0.2, 1.0, 0.15])
 # Widths of the box that sums up the line, pixels of the reduced image.
 _BOXES: Final = (1, 3, 5, 9, 15)
-_CLIPPED: Final = 0.97
-_GRID_PX: Final = 48
-# Neighbours on a chain: so many rows apart at most, and so many pixels for the noise and for each row.
+# Neighbours on a chain: so many rows apart at most, and so many columns apart for the noise; and so much slope.
 _REACH_ROWS: Final = 3
 _NOISE_PX: Final = 1.0
-_SLOPE_PX: Final = 0.6
-_STEEP_PX: Final = 1.5
-# A chain is cut where it climbs so much a row for so many points.
-_CLIFF_PX: Final = 1.25
-_CLIFF_POINTS: Final = 5
+_SLOPE: Final = 0.6
+_STEEP: Final = 1.5
+# A chain is cut where it climbs so steeply for so many points.
+_CLIFF: Final = 1.25
+_CLIFF_POINTS: Final = 4
 # Points, of 900 rows, that a jump costs: by the whole range; and any jump.
 _JUMP_POINTS: Final = 80.0
 _STEP_POINTS: Final = 6.0
 # What texture alone does not reach, points of 900 rows: in one piece, and in all pieces of an arm.
 _LONG_POINTS, _MANY_POINTS = 45.0, 160.0
 _PIECES: Final = 250
+# Share of an arm's points that it may lose to the other without being sought anew: those at the crossing.
+_FEW_LOST: Final = 0.1
 
 
 class Reduced(NamedTuple):
@@ -52,17 +51,25 @@ class Reduced(NamedTuple):
     Attributes
     ----------
     image : (h, w, 3) or (h, w), uint8.
-    factor : pixels of the full image to one of this.
-    first_row : row of the full image that row 0 is.
+    factor : columns of the full image to one of this.
+    row_step : rows of the full image from one row of this to the next.
+    first_column : of the full image that is in this.
     """
 
     image: NDArray[np.uint8]
     factor: int
-    first_row: int
+    row_step: int
+    first_column: int = 0
 
-    def full(self, rows: NDArray, columns: NDArray) -> tuple[Array, Array]:
-        """Columns u and rows v of the full image."""
-        return columns * self.factor + 0.5 * (self.factor - 1), rows * self.factor + float(self.first_row)
+    @property
+    def origin_uv(self) -> Array:
+        """Pixel (2,) of the full image in the middle of the first pixel of this."""
+        return np.array([self.first_column + 0.5 * (self.factor - 1), (self.row_step - 1) // 2])
+
+    @property
+    def pitch_uv(self) -> Array:
+        """Pixels (2,) of the full image from column to column and from row to row."""
+        return np.array([float(self.factor), float(self.row_step)])
 
 
 class Peaks(NamedTuple):
@@ -106,14 +113,31 @@ class Arms(NamedTuple):
 
 
 def reduce(image_bgr: NDArray[np.uint8]) -> Reduced:
-    """An image (H, W[, 3]) about 600 pixels wide."""
+    """An image (H, W[, 3]) about 600 pixels wide, of about 300 rows."""
     factor = max(1, round(image_bgr.shape[1] / _WIDTH_PX))
-    height, width = (side // factor for side in image_bgr.shape[:2])
-    first = (factor - 1) // 2
-    rows = image_bgr[first::factor][:height, : width * factor]
+    row_step = max(1, round(image_bgr.shape[0] / _ROWS))
+    rows = image_bgr[(row_step - 1) // 2 :: row_step][: image_bgr.shape[0] // row_step]
     if factor == 1:
-        return Reduced(rows, 1, 0)
-    return Reduced(np.asarray(cv2.resize(rows, (width, height), interpolation=cv2.INTER_AREA), np.uint8), factor, first)
+        return Reduced(rows, 1, row_step)
+    if factor % 2:
+        size = (rows.shape[1] // factor, len(rows))
+        narrow = cv2.resize(rows[:, : size[0] * factor], size, interpolation=cv2.INTER_AREA)
+        return Reduced(np.asarray(narrow, np.uint8), factor, row_step)
+    return Reduced(_pairs_averaged(rows, factor), factor, row_step, factor // 2 - 1)
+
+
+def _pairs_averaged(rows: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """Means over an even number of columns, from column factor / 2 - 1 on: faster than cv2.INTER_AREA.
+
+    Linear interpolation in the middle between two columns is their mean; one pair of each group after the other.
+    """
+    width = (rows.shape[1] - factor + 2) // factor
+    mean = np.zeros(0, np.uint8)
+    for k in range(factor // 2):
+        part = rows[:, 2 * k : 2 * k + width * factor]
+        pair = np.asarray(cv2.resize(part, (width, len(rows)), interpolation=cv2.INTER_LINEAR), np.uint8)
+        mean = np.asarray(cv2.addWeighted(mean, k / (k + 1), pair, 1 / (k + 1), 0), np.uint8) if k else pair
+    return mean
 
 
 def search(small: Reduced, camera: Camera, light: Laser, parameters: LaserParameters) -> Arms:
@@ -130,8 +154,8 @@ def search(small: Reduced, camera: Camera, light: Laser, parameters: LaserParame
     seen = evidence(small.image, parameters.gamma)
     box = _best_box(seen)
     peaks = _peaks(seen, box, small, parameters)
-    inverse_depth = inverse_depths(camera, light, peaks.u, peaks.v)
-    found = _both(peaks, inverse_depth, len(seen), parameters)
+    inverse_depth = on_sheets(camera, light, peaks.u, peaks.v).inverse_depth
+    found = _both(peaks, inverse_depth, small, parameters)
     pieces = [[_piece(peaks, m) for m in arm.members] if _seen(arm) else [] for arm in found]
     return Arms((pieces[0], pieces[1]), float(box * small.factor))
 
@@ -141,51 +165,24 @@ def _seen(arm: "_Arm") -> bool:
     return max(arm.gains, default=0.0) > _LONG_POINTS or sum(arm.gains) > _MANY_POINTS
 
 
-def _both(peaks: Peaks, inverse_depth: tuple[Array, Array], height: int, parameters: LaserParameters) -> list["_Arm"]:
+def _both(
+    peaks: Peaks, inverse_depth: tuple[Array, Array], small: Reduced, parameters: LaserParameters
+) -> list["_Arm"]:
     """Both arms; a peak that both claim goes to the piece that has more to say for itself."""
     everything = np.arange(len(peaks.row))
-    found = [_arm(peaks, q, everything, height, parameters) for q in inverse_depth]
+    found = [_arm(peaks, q, everything, small, parameters) for q in inverse_depth]
     claim = np.zeros((2, len(peaks.row)))
     for number, arm in enumerate(found):
         for members, gain in zip(arm.members, arm.gains, strict=True):
             claim[number, members] = gain
     for number, q in enumerate(inverse_depth):
         lost = (claim[number] > 0) & (claim[number] <= claim[1 - number] - number * 1e-9)
-        if lost.any():
-            found[number] = _arm(peaks, q, np.flatnonzero(~lost), height, parameters)
+        if lost.sum() > _FEW_LOST * (claim[number] > 0).sum():
+            found[number] = _arm(peaks, q, np.flatnonzero(~lost), small, parameters)
+        elif lost.any():
+            own = found[number]
+            found[number] = _Arm([m[~lost[m]] if (~lost[m]).sum() > 2 else m for m in own.members], own.gains)
     return found
-
-
-def evidence(image: NDArray[np.uint8], gamma: float) -> Floats:
-    """Light of the laser's colour (h, w), linear, 1 where it fills the sensor: the colour that texture least has.
-
-    The weights of the channels are those that give the laser most over the scatter, texture and noise together, of
-    the image from pixel to pixel: C^-1 s, with C that scatter's covariance and s the laser's colour.
-    """
-    light = np.asarray(cv2.LUT(image, linear_light(gamma)), np.float32)
-    if image.ndim == 2:
-        return light
-    some = light[2::5]
-    if np.abs(some - some[..., 1:2]).mean() < 0.002:
-        return np.ascontiguousarray(light[..., 1])
-    rough = (some - cv2.blur(some, (15, 1))).reshape(-1, 3)[::5]
-    limit = 4.5 * np.median(np.abs(rough), axis=0) + 1e-5
-    rough = np.clip(rough, -limit, limit)
-    scatter = (rough.T @ rough / len(rough)).astype(float)
-    weight = np.linalg.solve(scatter + 1e-3 * scatter[1, 1] * np.eye(3), _LASER_BGR)
-    weight /= weight @ _LASER_BGR
-    seen: Floats = np.asarray(cv2.transform(light, weight[None].astype(np.float32)), np.float32)
-    clipped = light[..., 1] > _CLIPPED
-    if clipped[::3].mean() > 1e-4:
-        # the core of an overexposed line is white between green edges
-        closed = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((1, image.shape[1] // 40 | 1), np.uint8))
-        np.copyto(seen, closed, where=clipped)
-    return seen
-
-
-def linear_light(gamma: float) -> Floats:
-    """Linear light (256,), 0..1, of the levels of an image."""
-    return ((np.arange(256) / 255) ** gamma).astype(np.float32)
 
 
 def _lobes(seen: Floats, box: int) -> tuple[Floats, Floats]:
@@ -199,7 +196,7 @@ def _lobes(seen: Floats, box: int) -> tuple[Floats, Floats]:
 
 def _best_box(seen: Floats) -> int:
     """The box that the line fills best: where the strongest peak of a row stands highest above the scatter."""
-    rows = np.ascontiguousarray(seen[4::12])
+    rows = np.ascontiguousarray(seen[4::16])
     strength = []
     for box in _BOXES:
         if 6 * box > seen.shape[1]:
@@ -215,48 +212,24 @@ def _peaks(seen: Floats, box: int, small: Reduced, parameters: LaserParameters) 
     top = cv2.dilate(strength, np.ones((1, 2 * (box // 2 + 1) + 1), np.uint8))
     mask = (strength >= top) & (strength > parameters.peak_sigmas)
     mask[:, 0] = mask[:, -1] = False
-    row, column = np.nonzero(mask)
-    before, at, after = (height[row, column + k].astype(float) for k in (-1, 0, 1))
+    place = np.flatnonzero(mask)
+    before, at, after = (height.ravel()[place + k].astype(float) for k in (-1, 0, 1))
     bend = np.maximum(2 * at - before - after, 1e-9)
-    u, v = small.full(row, column + np.clip(0.5 * (after - before) / bend, -0.5, 0.5))
-    return Peaks(row, u, v, strength[row, column].astype(float))
+    row, column = np.divmod(place, mask.shape[1])
+    column = column + np.clip(0.5 * (after - before) / bend, -0.5, 0.5)
+    (first_u, first_v), (step_u, step_v) = small.origin_uv, small.pitch_uv
+    return Peaks(row, column * step_u + first_u, row * step_v + first_v, strength.ravel()[place].astype(float))
 
 
 def _local_scatter(scatter: Floats) -> Floats:
     """Robust 1-sigma (h, w) of heights around each pixel, not below a third of that of the whole image."""
     size = np.abs(scatter)
-    usual = max(float(np.median(size[1::4, 1::3])), 1e-5)
+    usual = max(float(np.median(size[1::6, 1::5])), 1e-5)
     cells = (max(scatter.shape[1] // 16, 8), max(scatter.shape[0] // 16, 8))
     mean = cv2.resize(np.minimum(size, 4 * usual), cells, interpolation=cv2.INTER_AREA)
     # a mean of sizes is 0.8 sigma
     sigma = np.maximum(1.25 * cv2.GaussianBlur(mean, (0, 0), 2.0), 0.5 * usual)
     return np.asarray(cv2.resize(sigma, scatter.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
-
-
-def inverse_depths(camera: Camera, light: Laser, u: Array, v: Array) -> tuple[Array, Array]:
-    """1/Z (N,) of pixels (N,), (N,) on either sheet, 1/m, interpolated between the nodes of a grid (to 0.1 px)."""
-    columns, rows = (max(2, -(-side // _GRID_PX) + 1) for side in (camera.width, camera.height))
-    nodes = np.mgrid[:rows, :columns].reshape(2, -1)[::-1].T * float(_GRID_PX)
-    origin, direction = rays(camera, nodes)
-    at = np.stack([u, v]).astype(np.float32)[..., None] / np.float32(_GRID_PX)
-    found = []
-    for sheet in light.sheets:
-        normal = np.array(sheet.normal)
-        toward, gap = direction @ normal, sheet.offset - origin @ normal
-        grid = toward / (origin[:, 2] * toward + gap * direction[:, 2])
-        found.append(_sampled(np.clip(grid, -100, 100).reshape(rows, columns).astype(np.float32), at))
-    return found[0], found[1]
-
-
-def _sampled(nodes: Floats, at: Floats) -> Array:
-    """Values (N,) of a grid at fractional columns and rows (2, N, 1)."""
-    pieces = [
-        cv2.remap(
-            nodes, at[0, k : k + 30_000], at[1, k : k + 30_000], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-        for k in range(0, at.shape[1], 30_000)
-    ]
-    return np.concatenate([np.zeros((0, 1)), *pieces])[:, 0].astype(np.float64)
 
 
 # ------------------------------------------------------------------------------------------------ one arm
@@ -269,15 +242,17 @@ class _Arm(NamedTuple):
     gains: list[float]
 
 
-def _arm(peaks: Peaks, inverse_depth: Array, usable: Indices, height: int, parameters: LaserParameters) -> _Arm:
+def _arm(peaks: Peaks, inverse_depth: Array, usable: Indices, small: Reduced, parameters: LaserParameters) -> _Arm:
     """The best chain of pieces of line on one sheet, made of usable peaks."""
     q = inverse_depth[usable]
     own = usable[(q > 1 / parameters.range_max_m) & (q < 1 / parameters.range_min_m)]
     if len(own) < parameters.chain_min_points:
         return _Arm([], [])
     place = np.zeros(len(inverse_depth))
-    place[own] = _in_columns(peaks.take(own), inverse_depth[own])
-    chain = _without_cliffs(_linked(peaks.row[own], place[own]), peaks.row[own], place[own])
+    place[own] = _in_columns(peaks.take(own), inverse_depth[own], small.factor)
+    # what is a slope in the full image is so much steeper where rows are farther apart than columns
+    stretch, points = small.row_step / small.factor, 900 / len(small.image)
+    chain = _without_cliffs(_linked(peaks.row[own], place[own], stretch), peaks.row[own], place[own], stretch)
     length = np.bincount(chain)
     # of texture everywhere, the longest pieces
     enough = max(parameters.chain_min_points, int(np.sort(length)[-_PIECES:][0]))
@@ -289,27 +264,26 @@ def _arm(peaks: Peaks, inverse_depth: Array, usable: Indices, height: int, param
     gain = np.array([np.minimum(peaks.strength[m] / typical, 1).sum() for m in members])
     # a piece of the other arm looks steep
     steep = np.abs(ends[:, 3] - ends[:, 2]) / (ends[:, 1] - ends[:, 0])
-    gain *= np.maximum(1 - steep / _STEEP_PX, 0) * 900 / height
-    path = _best_path(gain, ends, 900 / height)
+    gain *= np.maximum(1 - steep / (_STEEP * stretch), 0) * points
+    path = _best_path(gain, ends, points, stretch)
     return _Arm([members[k] for k in path], [float(gain[k]) for k in path])
 
 
-def _in_columns(peaks: Peaks, inverse_depth: Array) -> Array:
-    """Place (N,) on the sheet in pixels of the reduced image: inverse depth over its change from column to column."""
-    step = np.diff(np.unique(peaks.v))
-    factor = float(np.median(step)) if len(step) else 1.0
+def _in_columns(peaks: Peaks, inverse_depth: Array, factor: int) -> Array:
+    """Place (N,) on the sheet in columns of the reduced image: inverse depth over its change from one to the next."""
     design = np.column_stack([np.ones(len(peaks.u)), peaks.u, peaks.v])
     per_px = abs(float(np.linalg.lstsq(design, inverse_depth, rcond=None)[0][1]))
     return inverse_depth / max(per_px * factor, 1e-12)
 
 
-def _linked(row: Indices, place: Array) -> NDArray[np.int32]:
+def _linked(row: Indices, place: Array, stretch: float) -> NDArray[np.int32]:
     """Number of the chain (N,) that each point is on: points of near rows that are each other's nearest hang together.
 
     Parameters
     ----------
     row : (N,) sorted.
-    place : (N,) along the row, on the sheet, pixels of the reduced image.
+    place : (N,) along the row, on the sheet, columns of the reduced image.
+    stretch : distance of rows over that of columns.
     """
     count = len(row)
     scale = 4 * (float(np.ptp(place)) + 10)
@@ -319,7 +293,7 @@ def _linked(row: Indices, place: Array) -> NDArray[np.int32]:
     below, above = np.full(count, -1), np.full(count, -1)
     for gap in range(1, _REACH_ROWS + 1):
         start, goal = np.flatnonzero(below < 0), np.flatnonzero(above < 0)
-        reach = _NOISE_PX + _SLOPE_PX * gap
+        reach = _NOISE_PX + _SLOPE * stretch * gap
         down, up = (
             _nearest(key[start] + gap * scale, key[goal], reach),
             _nearest(key[goal] - gap * scale, key[start], reach),
@@ -333,14 +307,14 @@ def _linked(row: Indices, place: Array) -> NDArray[np.int32]:
     return chain
 
 
-def _without_cliffs(chain: NDArray, row: Indices, place: Array) -> NDArray:
+def _without_cliffs(chain: NDArray, row: Indices, place: Array, stretch: float) -> NDArray:
     """Chains (N,) cut where they turn off as steeply as the other arm does: there one runs on along the other.
 
     Points of the steep stretch have chains of their own.
     """
     order = np.lexsort((row, chain))
     ahead, behind = order[_CLIFF_POINTS:], order[:-_CLIFF_POINTS]
-    steep = np.abs(place[ahead] - place[behind]) > _CLIFF_PX * (row[ahead] - row[behind])
+    steep = np.abs(place[ahead] - place[behind]) > _CLIFF * stretch * (row[ahead] - row[behind])
     steep = np.flatnonzero(steep & (chain[ahead] == chain[behind]))
     alone = np.zeros(len(row), bool)
     for k in range(_CLIFF_POINTS + 1):
@@ -378,11 +352,12 @@ def _typical_strength(strength: Array, members: list[Indices]) -> float:
 
 
 def _end_values(value: Array) -> tuple[float, float]:
-    """Medians of the first and the last five."""
-    return float(np.median(value[:5])), float(np.median(value[-5:]))
+    """Middle values of the first and the last five."""
+    first, last = sorted(value[:5].tolist()), sorted(value[-5:].tolist())
+    return first[len(first) // 2], last[len(last) // 2]
 
 
-def _best_path(gain: Array, ends: Array, scale: float) -> list[int]:
+def _best_path(gain: Array, ends: Array, scale: float, stretch: float) -> list[int]:
     """Pieces that follow each other down the image, most points for fewest jumps: dynamic programming.
 
     Parameters
@@ -390,6 +365,7 @@ def _best_path(gain: Array, ends: Array, scale: float) -> list[int]:
     gain : (M,) what speaks for each piece, points.
     ends : (M, 4) first and last row; place on the sheet there, columns of the reduced image.
     scale : points to a row.
+    stretch : distance of rows over that of columns.
     """
     order = np.argsort(ends[:, 0], kind="stable")
     gain, (top, bottom, at_top, at_bottom) = gain[order], ends[order].T
@@ -398,7 +374,7 @@ def _best_path(gain: Array, ends: Array, scale: float) -> list[int]:
         jump = np.abs(at_top[k] - at_bottom[:k])
         gap = top[k] - bottom[:k]
         # what a bottom without steps may do in between costs nothing
-        sudden = np.maximum(jump - _NOISE_PX - _SLOPE_PX * np.maximum(gap, 1), 0)
+        sudden = np.maximum(jump - _NOISE_PX - _SLOPE * stretch * np.maximum(gap, 1), 0)
         cost = _JUMP_POINTS * jump / np.minimum(at_top[k], at_bottom[:k]) + _STEP_POINTS * np.minimum(sudden, 1)
         total = best[:k] - cost - np.maximum(1 - gap, 0) * scale
         total[bottom[:k] >= bottom[k]] = -np.inf

@@ -9,13 +9,13 @@ from ..schemas.calibration import Camera, Laser, LaserPlane
 from ..schemas.parameters import LaserParameters
 from . import cross, laser, line_profile, sheet_search
 from .camera import normalised, project, rays
+from .sheet_grid import on_sheets
 
 Array = NDArray[np.float64]
 
 # A Gaussian line of 100 grey levels is below one half at 3.3 sigma.
 _REACH_SIGMAS = 3.3
 _LEAST_NEAR = 8
-_BESIDE_PX = 20.0
 
 
 class Soundings(NamedTuple):
@@ -71,12 +71,11 @@ def triangulate(camera: Camera, light: Laser, uv: Array, arm: NDArray, sigma_px:
     """
     uv = np.asarray(uv, float).reshape(-1, 2)
     X, sigma = np.full((len(uv), 3), np.nan), np.full(len(uv), np.nan)
-    tenth = np.array([0.1, 0.0])
+    change = on_sheets(camera, light, *uv.T).per_px
     for number, sheet in enumerate(light.sheets):
-        own = np.asarray(arm) == number
+        own = np.flatnonzero(np.asarray(arm) == number)
         X[own], distance = intersect(camera, sheet, uv[own])
-        change = intersect(camera, sheet, uv[own] + tenth)[1] - distance
-        sigma[own] = 10 * np.abs(change) * np.asarray(sigma_px)[own]
+        sigma[own] = np.abs(distance * change[number][own]) * np.asarray(sigma_px)[own]
     return Soundings(uv, np.asarray(arm).astype(np.uint8), X, sigma)
 
 
@@ -188,20 +187,21 @@ def _sound_sheets(
     if keep.sum() < parameters.min_soundings:
         return nothing(_no_cross(len(keep), int(keep.sum())))
     soundings = soundings.take(keep)
-    every = slice(None, None, small.factor)
-    whole = cross.whole_line(line.uv[every], line.arm[every], small.factor, image_bgr.shape[:2])
+    every = slice(None, None, small.row_step)
+    whole = cross.whole_line(line.uv[every], line.arm[every], small.row_step, image_bgr.shape[:2])
     reach = _REACH_SIGMAS * float(np.median(line.width_px))
-    first = np.array([0.5 * (small.factor - 1), small.first_row])
-    glow = laser.glow(small.image, (whole - first) / small.factor, reach / small.factor, 1) * small.factor + first
+    first, pitch = small.origin_uv, small.pitch_uv
+    patch = (3.0, 3.0 * small.factor / small.row_step)
+    glow = laser.glow(small.image, (whole - first) / pitch, reach / small.factor, patch) * pitch + first
     return ImageSoundings(soundings, np.concatenate([whole, glow]), reach, "", agreement(soundings))
 
 
 def _apart(camera: Camera, light: Laser, line: line_profile.Line) -> NDArray[np.bool_]:
     """Which points (N,) are clear of the crossing: on a level bottom the other arm is far from them in their row."""
     u, v = line.uv.T
-    first, second = sheet_search.inverse_depths(camera, light, u, v)
-    beside = sheet_search.inverse_depths(camera, light, u + _BESIDE_PX, v)
-    per_px = 0.5 * (np.abs(beside[0] - first) + np.abs(beside[1] - second)) / _BESIDE_PX
+    seen = on_sheets(camera, light, u, v)
+    first, second = seen.inverse_depth
+    per_px = 0.5 * (np.abs(first * seen.per_px[0]) + np.abs(second * seen.per_px[1]))
     return np.abs(first - second) > line_profile.APART * line.width_px * per_px
 
 
@@ -225,7 +225,7 @@ def _sound_paper(
         return nothing(_no_cross(len(points.uv), int(keep.sum())))
     line = cross.whole_line(points.uv, found.arm, points.step_px, image_bgr.shape[:2])
     reach = _REACH_SIGMAS * float(np.median(points.width_px))
-    line = np.concatenate([line, laser.glow(image_bgr, line, reach, points.step_px)])
+    line = np.concatenate([line, laser.glow(image_bgr, line, reach, (3.0 * points.step_px, 3.0 * points.step_px))])
     soundings = soundings.take(keep)
     return ImageSoundings(soundings, line, reach, "", agreement(soundings))
 
@@ -236,13 +236,12 @@ def agreement(soundings: Soundings) -> Agreement | None:
     Near the crossing (within a tenth of the range, half of it on either side) each arm's depth is a straight line in
     its own direction; the two are compared where they cross in plan.
     """
-    ends = []
-    where = _crossing(soundings)
+    arms = [soundings.X_camera[soundings.arm == number] for number in (0, 1)]
+    where = _crossing(arms)
     if where is None:
         return None
-    reach = 0.1 * float(np.median(soundings.X_camera[:, 2]))
-    for number in (0, 1):
-        X = soundings.X_camera[soundings.arm == number]
+    ends, reach = [], 0.1 * float(np.median(arms[0][:, 2]))
+    for X in arms:
         along = X[:, 1] - where
         near = np.abs(along) < reach
         if min((near & (along < 0)).sum(), (near & (along > 0)).sum()) < _LEAST_NEAR:
@@ -251,14 +250,15 @@ def agreement(soundings: Soundings) -> Agreement | None:
     return Agreement(ends[1][0] - ends[0][0], float(np.hypot(ends[0][1], ends[1][1])))
 
 
-def _crossing(soundings: Soundings) -> float | None:
+def _crossing(arms: list[Array]) -> float | None:
     """Camera y, metres, at which both arms have the same x, if they do."""
-    lines = [soundings.X_camera[soundings.arm == number] for number in (0, 1)]
-    if min(map(len, lines)) < 2 * _LEAST_NEAR:
+    if min(map(len, arms)) < 2 * _LEAST_NEAR:
         return None
-    lines = [X[np.argsort(X[:, 1])] for X in lines]
-    y = np.linspace(max(X[0, 1] for X in lines), min(X[-1, 1] for X in lines), 400)
-    apart = np.interp(y, lines[0][:, 1], lines[0][:, 0]) - np.interp(y, lines[1][:, 1], lines[1][:, 0])
+    # every few points: where both arms pass is looked for no finer than in 400 places
+    few = [X[:: max(1, len(X) // 800)] for X in arms]
+    (x_a, y_a), (x_b, y_b) = (X[np.argsort(X[:, 1], kind="stable"), :2].T for X in few)
+    y = np.linspace(max(y_a[0], y_b[0]), min(y_a[-1], y_b[-1]), 400)
+    apart = np.interp(y, y_a, x_a) - np.interp(y, y_b, x_b)
     change = np.flatnonzero(np.sign(apart[1:]) != np.sign(apart[:-1]))
     return float(y[change[len(change) // 2]]) if len(change) and y[-1] > y[0] else None
 

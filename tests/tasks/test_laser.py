@@ -191,9 +191,9 @@ def test_glow_is_the_green_light_that_no_row_has_a_peak_of_and_that_touches_the_
     for place in (bar, apart):
         image[place] += np.array([8, 45, 6], np.uint8)
     line = np.column_stack([truth, np.arange(len(truth))])
-    found = laser.glow(image, line, 9.0, 1)
+    found = laser.glow(image, line, 9.0, (3, 3))
     erased = laser.mask(image.shape[:2], np.concatenate([line, found]), 9.0)
     assert erased[bar].all()
     assert not erased[apart].any()
-    assert len(laser.glow(np.ascontiguousarray(image[..., 1]), line, 9.0, 1)) == 0
-    assert len(laser.glow(image, np.zeros((0, 2)), 9.0, 1)) == 0
+    assert len(laser.glow(np.ascontiguousarray(image[..., 1]), line, 9.0, (3, 3))) == 0
+    assert len(laser.glow(image, np.zeros((0, 2)), 9.0, (3, 3))) == 0
