@@ -53,10 +53,10 @@ def flat(
     """Sheets and mount angles over a pool's floor or a flat seabed, sailed at several altitudes."""
     from ..schemas.parameters import Parameters
     from ..tasks.calibration_flat import Priors
-    from . import calibrate
+    from .calibrate_flat import run_flat
 
     priors = Priors(sheet_deg=sheet_deg, sheet_m=1e-3 * sheet_mm, altimeter_m=1e-3 * altimeter_mm)
-    _show(calibrate.run_flat(missions, out, _start(start), priors, Parameters(), boresight, images))
+    _show(run_flat(missions, out, _start(start), priors, Parameters(), boresight, images))
 
 
 @app.command()
@@ -106,10 +106,10 @@ def field(
     """Sheets, mount angles and the navigation's clock from the crossovers of an ordinary mission."""
     from ..schemas.parameters import Parameters
     from ..tasks.calibration_field import FieldPriors
-    from . import calibrate
+    from .calibrate_field import run_field
 
     priors = FieldPriors(sheet_deg=sheet_deg, sheet_m=1e-3 * sheet_mm, altimeter_m=1e-3 * altimeter_mm)
-    _show(calibrate.run_field(mission, out, _start(start), priors, Parameters(), images))
+    _show(run_field(mission, out, _start(start), priors, Parameters(), images))
 
 
 def _lines(text: str, start: Any) -> Any:
