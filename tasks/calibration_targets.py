@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.parameters import LaserParameters
-from . import laser
+from . import corner_fit, laser
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -55,12 +55,14 @@ def corners(grey: Grey, board: Board) -> tuple[Array, Array] | None:
     stretched = np.clip(grey.astype(np.float32) * (200 / bright), 0, 255).astype(np.uint8)
     if board.kind == "charuco":
         return _charuco(grey, board)
+    size = board.columns, board.rows
     for image in (stretched, grey):
-        found = _chessboard(image, (board.columns, board.rows))
+        found = _chessboard(image, size)
         if found is not None:
             y, x = np.mgrid[: board.rows, : board.columns]
             flat = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * board.square_m
-            return flat.astype(np.float64), found
+            # the stretched picture is clipped where the glare is; the fit is given all grey levels
+            return flat.astype(np.float64), corner_fit.refined(grey, found, size)
     return None
 
 

@@ -76,6 +76,7 @@ def board(
     ] = None,
     hold_camera: Annotated[bool, typer.Option(help="Take the camera of --start as right.")] = False,
     model: Annotated[Literal["brown", "fisheye"], typer.Option(help="Camera where there is no --start.")] = "brown",
+    bent: Annotated[bool, typer.Option(help="The board may not be flat: estimate its shape too.")] = False,
 ) -> None:
     """Camera and sheets from photographs of a chessboard or ChArUco board in the laser's light."""
     import cv2
@@ -89,7 +90,7 @@ def board(
         remedy = "Write DICT_4X4_50, DICT_5X5_100 or another of OpenCV's."
         raise InvalidInput([Problem("--dictionary", None, "", dictionary, "a dictionary of markers", remedy)])
     target = Board(kind, columns, rows, 1e-3 * square_mm, marker_share, dictionary)
-    setup = calibrate_board.BoardSetup(target, _lines(lines, begun), beside, begun, hold_camera, model)
+    setup = calibrate_board.BoardSetup(target, _lines(lines, begun), beside, begun, hold_camera, model, bent)
     _show(calibrate_board.run_board(folder, out, setup, Parameters()))
 
 
