@@ -1,6 +1,6 @@
 """`seamosaic calibrate board`: photographs of a chessboard or ChArUco board with the laser on it, or beside it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
@@ -21,6 +21,7 @@ from ..tasks.calibration_sheets import as_plane, basis, block, sheet_names, step
 from . import calibrate
 from . import calibration_report as report
 from .job import log
+from .progress import progress
 
 Array = NDArray[np.float64]
 Lines = Literal["cross"] | int
@@ -107,7 +108,7 @@ def _look(folder: Path, setup: BoardSetup, parameters: Parameters) -> _Seen:
         remedy = "Give the folder that holds the photographs."
         raise InvalidInput([Problem(str(folder), None, "", "no images", "JPEG, PNG or TIFF images", remedy)])
     names, corners, light, sizes = [], [], [], []
-    for path in paths:
+    for path in _shown(paths, folder.name):
         image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             log.warning("step=calibrate image=%s rejected: it cannot be decoded", path.name)
@@ -123,6 +124,14 @@ def _look(folder: Path, setup: BoardSetup, parameters: Parameters) -> _Seen:
         light.append(_light(bgr, board[1], setup, parameters))
     _enough(folder, setup, names, sizes, light)
     return _Seen(tuple(names), corners, light, sizes[0])
+
+
+def _shown(paths: Sequence[Path], name: str) -> Iterator[Path]:
+    """The paths one by one, and how far they are."""
+    with progress(name, "photographs", len(paths)) as advance:
+        for path in paths:
+            yield path
+            advance(1)
 
 
 def _enough(folder: Path, setup: BoardSetup, names: list, sizes: list, light: list[targets.Light]) -> None:

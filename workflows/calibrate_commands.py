@@ -33,6 +33,15 @@ AltimeterOption = Annotated[
 ]
 
 
+@app.callback()
+def _begin(
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more of what is done.")] = False,
+) -> None:
+    from .progress import log_to_stderr
+
+    log_to_stderr(verbose)
+
+
 def _start(path: Path | None) -> Any:
     from .calibrate_inputs import read_calibration
 
