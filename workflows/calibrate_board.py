@@ -114,7 +114,7 @@ def _look(folder: Path, setup: BoardSetup, parameters: Parameters) -> _Seen:
             log.warning("step=calibrate image=%s rejected: it cannot be decoded", path.name)
             continue
         bgr = np.asarray(image, np.uint8)
-        board = targets.corners(np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8), setup.board)
+        board = targets.corners(targets.without_light(bgr), setup.board)
         if board is None:
             log.warning("step=calibrate image=%s rejected: no board found", path.name)
             continue
