@@ -26,8 +26,11 @@ _ROUNDS_BENT: Final = 7
 _BEND: Final = 0.01  # how far a board may bend, as a share of its size
 _PRINTED: Final = 0.01  # how far a corner may be from its place, as a share of the distance to the next
 _NUDGE_M: Final = 1e-6
+_MOST_ALIKE: Final = 0.9
+_LEAST_LEFT_OUT: Final = 4
 _OUTLIER_SIGMAS: Final = 4.5
 _CORNER_SIGMA_PX: Final = 0.1
+_BEST_CORNER_PX: Final = 0.03  # what neighbours have in common, from the raster of pixels, shows in no residual
 _HELD: Final = 1e-7  # of a parameter that is not to change, as a share of its scale
 _PINHOLE: Final = ("fx", "fy", "cx", "cy")
 _SCALE: Final = {"fx": 10.0, "fy": 10.0, "cx": 10.0, "cy": 10.0, "p1": 0.002, "p2": 0.002}
@@ -141,8 +144,11 @@ def calibrate_board(data: BoardData, camera: Camera, free: Sequence[str], bent: 
         solved = solve(lambda x, p=chosen: _residuals(x, p), x, _layout(chosen), _rows(chosen))
         x = solved.x
         corner, laser = _groups(chosen)
-        sigma = np.clip(problem.corner_sigma * unit_sigma(solved, corner), 0.005, 5)
-        factor = np.clip(problem.laser_sigma * unit_sigma(solved, laser), 0.05, 50) if laser.any() else 1.0
+        sigma = np.clip(problem.corner_sigma * unit_sigma(solved, corner), _BEST_CORNER_PX, 5)
+        factor = 1.0
+        if laser.any():
+            unit = unit_sigma(solved, laser) * _alike(solved.residual[laser], chosen.data)
+            factor = np.clip(problem.laser_sigma * unit, 0.05, 50)
         problem = problem._replace(corner_sigma=float(sigma), laser_sigma=float(factor))
         corner_off, laser_off = _misfits(x, problem)
         corner_used, laser_used = _within(np.hypot(*corner_off.T)), _within(np.abs(laser_off))
@@ -173,6 +179,15 @@ def _released(p: _Problem, x: Array, off: Array, used: NDArray[np.bool_], printe
     np.add.at(right, number, np.einsum("pki,pkj,pj->pi", J, J, now[number]) - np.einsum("pki,pk->pi", J, off))
     prior = (p.corner_sigma / (_PRINTED * float(np.min(pdist(places))))) ** 2 * np.eye(3)
     return d._replace(corner_board=printed + np.linalg.solve(normal + prior, right[..., None])[number, :, 0])
+
+
+def _alike(residual: Array, data: BoardData) -> float:
+    """By how much neighbours on a line that err alike (at the edges of squares, on a bent board) widen their sigma."""
+    same = (np.diff(data.laser_image) == 0) & (np.diff(data.laser_sheet) == 0)
+    product = float((residual[1:] * residual[:-1])[same].sum())
+    correlation = product / max(float((residual[1:] ** 2)[same].sum()), 1e-12)
+    correlation = float(np.clip(correlation, 0.0, _MOST_ALIKE))
+    return float(np.sqrt((1 + correlation) / (1 - correlation)))
 
 
 def _within(off: Array) -> NDArray[np.bool_]:
@@ -306,10 +321,10 @@ def _result(x: Array, solved: Solved, p: _Problem, corner_used: NDArray, laser_u
     corner, _ = _misfits(x, p)
     light = _on_board(state, p.data)
     size = len(p.names) + 3 * len(p.starts)
-    left_out, left_out_m = _left_out(x, p, corner_used, laser_used)
+    left_out, left_out_m, others = _left_out(x, p, corner_used, laser_used)
     steps = x[len(p.names) : size]
     covariance = solved.covariance[:size, :size]
-    wide = _widened(covariance, left_out, state.sheets, p.starts, len(p.names))
+    wide = _widened(covariance, others[:, :size])
     ranges = [light[laser_used & (p.data.laser_image == k)] for k in range(p.data.images)]
     return BoardResult(
         camera=state.camera,
@@ -334,23 +349,24 @@ def _result(x: Array, solved: Solved, p: _Problem, corner_used: NDArray, laser_u
     )
 
 
-def _without(x: Array, p: _Problem, corner: NDArray, laser: NDArray, image: int) -> _State:
-    """What an adjustment finds that knows nothing of the light in one image."""
+def _without(x: Array, p: _Problem, corner: NDArray, laser: NDArray, image: int) -> tuple[_State, Array]:
+    """What an adjustment finds, and its shared unknowns, that knows nothing of the light in one image."""
     chosen = _chosen(p, corner, laser & (p.data.laser_image != image))
     solved = solve(lambda y: _residuals(y, chosen), x, _layout(chosen), _rows(chosen))
-    return _unpacked(solved.x, chosen)
+    return _unpacked(solved.x, chosen), _layout(chosen).split(solved.x)[0]
 
 
-def _left_out(x: Array, p: _Problem, corner: NDArray, laser: NDArray) -> tuple[Array, Array]:
-    """Sheets (n, S, 4) without the light of each image, and what they are off by on it (n, S).
+def _left_out(x: Array, p: _Problem, corner: NDArray, laser: NDArray) -> tuple[Array, Array, Array]:
+    """Sheets (n, S, 4) without the light of each image, what they are off by on it (n, S), and what is shared (n, K).
 
-    The latter is the rms distance, metres, across the board, of the image's light, triangulated with these sheets,
+    The second is the rms distance, metres, across the board, of the image's light, triangulated with these sheets,
     from the board as its corners alone place it. NaN where too little is left to tell.
     """
     count, lit = len(p.starts), p.data.laser_image
     sheets, rms = np.full((p.data.images, count, 4), np.nan), np.full((p.data.images, count), np.nan)
+    shared = np.full((p.data.images, _layout(p).shared), np.nan)
     for k in np.unique(lit[laser]):
-        state = _without(x, p, corner, laser, int(k))
+        state, found = _without(x, p, corner, laser, int(k))
         for s in range(count):
             own = laser & (p.data.laser_sheet == s)
             if len(np.unique(lit[own & (lit != k)])) < 2:
@@ -360,7 +376,11 @@ def _left_out(x: Array, p: _Problem, corner: NDArray, laser: NDArray) -> tuple[A
             if here.any():
                 X = cast_rays(*rays(state.camera, p.data.laser_uv[here]), state.sheets[s])
                 rms[k, s] = float(np.sqrt(np.mean(_above(state, int(k), X) ** 2)))
-    return sheets, rms
+        # a sheet that fewer than two other images have is nowhere without this one, and would speak for no scatter
+        shared[k] = found
+        lost = np.isnan(sheets[k]).any(1)
+        shared[k, len(p.names) : len(p.names) + 3 * count][np.repeat(lost, 3)] = np.nan
+    return sheets, rms, shared
 
 
 def _above(state: _State, image: int, X: Array) -> Array:
@@ -370,24 +390,16 @@ def _above(state: _State, image: int, X: Array) -> Array:
     return on_board[:, 2] - heights(state.shape, on_board[:, :2])
 
 
-def _widened(covariance: Array, left_out: Array, sheets: Array, starts: Sequence[SheetBasis], first: int) -> Array:
-    """The covariance with each sheet's rows scaled up to the jackknife's variance where that is larger.
+def _widened(covariance: Array, left_out: Array) -> Array:
+    """The covariance (K, K) scaled up to the jackknife's variances where these are larger.
 
-    Errors that all points of an image share (a bent board, glare) do not show in the residuals, but in how much the
-    sheets change when an image is left out.
+    Errors that all points of an image share (a bent board, glare) do not show in the residuals, but in how much camera
+    and sheets change when the light of an image is left out: left_out (n, K), NaN where that says nothing.
     """
     factor = np.ones(len(covariance))
-    for s, start in enumerate(starts):
-        known = np.isfinite(left_out[:, s]).all(1)
-        count = int(known.sum())
-        if count < 4:
-            continue
-        sign = np.sign(left_out[known, s, :3] @ sheets[s, :3])
-        others = left_out[known, s] * sign[:, None]
-        turn = (others[:, :3] - sheets[s, :3]) @ start.tangents.T
-        shift = others[:, 3] - others[:, :3] @ start.anchor
-        steps = np.column_stack([turn, shift])
-        variance = (count - 1) * np.mean((steps - steps.mean(0)) ** 2, axis=0)
-        own = slice(first + 3 * s, first + 3 * s + 3)
-        factor[own] = np.sqrt(np.maximum(variance / np.diag(covariance)[own], 1.0))
+    for k, values in enumerate(left_out.T):
+        known = values[np.isfinite(values)]
+        if len(known) >= _LEAST_LEFT_OUT and covariance[k, k] > 0:
+            variance = (len(known) - 1) * float(known.var())
+            factor[k] = np.sqrt(max(variance / covariance[k, k], 1.0))
     return covariance * np.outer(factor, factor)

@@ -119,9 +119,9 @@ def _look(folder: Path, setup: BoardSetup, parameters: Parameters) -> _Seen:
             log.warning("step=calibrate image=%s rejected: no board found", path.name)
             continue
         names.append(path.name)
-        corners.append(board)
-        sizes.append((bgr.shape[1], bgr.shape[0]))
         light.append(_light(bgr, board[1], setup, parameters))
+        corners.append(targets.clear_of(board, light[-1].uv))
+        sizes.append((bgr.shape[1], bgr.shape[0]))
     _enough(folder, setup, names, sizes, light)
     return _Seen(tuple(names), corners, light, sizes[0])
 
