@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 from seamosaic.schemas.problems import InvalidInput
-from seamosaic.tasks.calibration_sheets import altitude_error, basis, step_jacobian
+from seamosaic.tasks.calibration_sheets import altitude_error, basis, sensitivity, step_jacobian
 from seamosaic.workflows.calibrate_inputs import read_calibration
 from seamosaic.workflows.cli import app
 from typer.testing import CliRunner
@@ -123,14 +123,19 @@ def test_board(tmp_path: Path):
         error = getattr(found.camera, name) - getattr(true.camera, name)
         assert abs(error) < 3 * sigma[f"camera.{name}"]
         assert 0.02 < sigma[f"camera.{name}"] < 5
-    for s, sheet in enumerate(true.laser.sheets):
-        other = np.array([*found.laser.sheets[s].normal, found.laser.sheets[s].offset])
-        plane = np.array([*sheet.normal, sheet.offset])
-        assert abs(altitude_error(true.camera, plane, other, 2.5)) < 0.0025
-        begun = read_calibration(start).laser
-        assert begun is not None
-        before = np.array([*begun.sheets[s].normal, begun.sheets[s].offset])
-        assert abs(altitude_error(true.camera, plane, before, 2.5)) > 0.01
+    names = [k for k, name in enumerate(block.parameters) if name.startswith("laser.")]
+    covariance = np.array(block.matrix)[np.ix_(names, names)]
+    (stated,) = sensitivity(true.camera, true.laser.sheets, np.array([2.5])).sigma_m(covariance)
+    begun = read_calibration(start).laser
+    assert begun is not None
+    off = {}
+    for name, light in (("before", begun), ("after", found.laser)):
+        pairs = zip(true.laser.sheets, light.sheets, strict=True)
+        planes = [(np.array([*a.normal, a.offset]), np.array([*b.normal, b.offset])) for a, b in pairs]
+        off[name] = np.array([altitude_error(true.camera, a, b, 2.5) for a, b in planes])
+    assert 0.0001 < stated < 0.004
+    assert abs(off["after"].mean()) < 3 * stated
+    assert np.abs(off["before"]).max() > 2 * np.abs(off["after"]).max()
     page = (out / "calibration-report.html").read_text()
     assert "Left-out light" in page
     assert page.count("data:image/png") == 3
