@@ -54,7 +54,7 @@ def test_etna():
     camera = start.first_camera(corners, size, "brown", free)
     flat, bent = (board.calibrate_board(data, camera, free, bent=bent) for bent in (False, True))
     rms = [np.sqrt(np.nanmean(found.left_out_m**2)) for found in (flat, bent)]
-    assert 0.00005 < rms[1] < 0.0003
+    assert 0.00005 < rms[1] < 0.00035
     assert rms[1] < 0.6 * rms[0]
     assert bent.corner_sigma_px < 0.1
     for sheet in bent.left_out_sheets[:, 0]:
