@@ -62,9 +62,9 @@ class FeatureParameters(Model):
 
     max_features: Annotated[int, Field(ge=100, le=50_000)] = 4000
     max_pixels: Annotated[
-        int, Field(ge=100_000, description="images are halved until they have no more pixels than this")
-    ] = 3_000_000
-    contrast_threshold: Annotated[float, Field(gt=0, le=0.2)] = 0.01
+        int, Field(ge=100_000, description="images with more pixels are scaled down to this")
+    ] = 700_000
+    contrast_threshold: Annotated[float, Field(gt=0, le=0.2)] = 0.004
 
 
 class MatchParameters(Model):
@@ -92,7 +92,7 @@ class AdjustParameters(Model):
     tie_cells: Annotated[
         int, Field(ge=4, le=64, description="cells along an image's longer side, each with its share of tie points")
     ] = 16
-    tie_points_per_cell: Annotated[int, Field(ge=1, le=50)] = 2
+    tie_points_per_cell: Annotated[int, Field(ge=1, le=50)] = 4
     max_ranges: Annotated[
         int, Field(ge=0, le=2000, description="tie points of an image that its laser tells the range of, at most")
     ] = 150

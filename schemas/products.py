@@ -95,6 +95,26 @@ class SoundingQuality(Model):
     )
 
 
+class CalibrationQuality(Model):
+    """What the calibration behind the maps is worth, and what the data say of it."""
+
+    sigma_m: Annotated[
+        Metres | None,
+        Field(
+            description="1-sigma that all soundings have in common, by the calibration's covariance, median over "
+            "soundings; it is part of uncertainty.tif and of the sigma of soundings.laz; absent without covariance"
+        ),
+    ] = None
+    laser_gap_m: Annotated[
+        float | None, Field(description="how much deeper arm b has the seabed than arm a where they meet, median")
+    ] = None
+    laser_gap_sigma_m: Metres | None = None
+    laser_gap_images: Count = 0
+    pinhole_percent: Annotated[
+        float | None, Field(description="flat port: by how much a pinhole fitted instead would make altitudes wrong")
+    ] = None
+
+
 class PairQuality(Model):
     """Relative motions between overlapping images."""
 
@@ -172,6 +192,7 @@ class Quality(Model):
     mission: MissionSummary
     soundings: SoundingQuality | None = None
     pairs: PairQuality | None = None
+    calibration: CalibrationQuality | None = None
     trajectory: TrajectoryQuality | None = None
     bathymetry: BathymetryQuality | None = None
     mosaic: MosaicQuality | None = None

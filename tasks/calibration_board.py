@@ -4,33 +4,35 @@ The board is the plane z = 0 of its own frame, x and y along its rows and column
 """
 
 from collections.abc import Sequence
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from ..schemas.calibration import Camera
+from .board_shape import FLAT, Shape, around, heights, meet
+from .calibration_board_start import DISTORTION, first_poses, first_sheet
 from .calibration_sheets import SheetBasis, cast_rays, moved
 from .calibration_solve import Layout, Solved, solve, unit_sigma
 from .camera import project, rays
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Model = Literal["brown", "fisheye", "flat-port"]
 
 _ROUNDS: Final = 4
+_ROUNDS_BENT: Final = 7
+_BEND: Final = 0.01  # how far a board may bend, as a share of its size
+_PRINTED: Final = 0.01  # how far a corner may be from its place, as a share of the distance to the next
+_NUDGE_M: Final = 1e-6
+_MOST_ALIKE: Final = 0.9
+_LEAST_LEFT_OUT: Final = 4
 _OUTLIER_SIGMAS: Final = 4.5
 _CORNER_SIGMA_PX: Final = 0.1
-_POINTS_A_LINE: Final = 60
+_BEST_CORNER_PX: Final = 0.03  # what neighbours have in common, from the raster of pixels, shows in no residual
 _HELD: Final = 1e-7  # of a parameter that is not to change, as a share of its scale
 _PINHOLE: Final = ("fx", "fy", "cx", "cy")
-_DISTORTION: Final = {
-    "brown": ("k1", "k2", "p1", "p2", "k3"),
-    "flat-port": ("k1", "k2", "p1", "p2", "k3"),
-    "fisheye": ("k1", "k2", "k3", "k4"),
-}
 _SCALE: Final = {"fx": 10.0, "fy": 10.0, "cx": 10.0, "cy": 10.0, "p1": 0.002, "p2": 0.002}
 
 
@@ -61,11 +63,13 @@ class BoardResult(NamedTuple):
     ----------
     camera : interior orientation. camera_names : of the covariance's first rows, as "fx".
     R_camera_board, t_camera_board : (n, 3, 3), (n, 3) metres.
+    shape : of the board; flat unless it was asked for.
     sheets : (S, 4) normals and offsets. starts, steps : from which covariance's steps are measured, S and (3 S,).
     covariance : (c + 3 S,) squared, of camera and steps; widened to what leaving images out says, if that is more.
     corner_residual_px : (P, 2). corner_used : (P,).
     laser_residual_m : (L,) distance of the light on the board from the sheet, along the sheet's normal.
-    laser_used : (L,). corner_sigma_px, laser_sigma : measured 1-sigma (pixels; stated sigmas).
+    light_on_board : (L, 3) in the board's frame. laser_used : (L,).
+    corner_sigma_px, laser_sigma : measured 1-sigma (pixels; stated sigmas).
     left_out_m : (n, S) rms distance from the board (by its corners alone) of an image's light, triangulated by an
         adjustment without it. left_out_sheets : (n, S, 4) its sheets. range_m : (n,) median range of the light.
     """
@@ -74,6 +78,7 @@ class BoardResult(NamedTuple):
     camera_names: tuple[str, ...]
     R_camera_board: Array
     t_camera_board: Array
+    shape: Shape
     sheets: Array
     starts: tuple[SheetBasis, ...]
     steps: Array
@@ -81,6 +86,7 @@ class BoardResult(NamedTuple):
     corner_residual_px: Array
     corner_used: NDArray[np.bool_]
     laser_residual_m: Array
+    light_on_board: Array
     laser_used: NDArray[np.bool_]
     corner_sigma_px: float
     laser_sigma: float
@@ -98,68 +104,19 @@ class _Problem(NamedTuple):
     per_px: Array
     corner_sigma: float
     laser_sigma: float
+    shape: Shape
 
 
-def thinned(uv: Array, sheet: Indices, sigma_px: Array) -> Indices:
-    """Indices of at most sixty points of each line (N,), spread along it."""
-    chosen = []
-    for number in np.unique(sheet[sheet >= 0]):
-        own = np.flatnonzero(sheet == number)
-        own = own[np.argsort(uv[own, 1], kind="stable")]
-        chosen.append(own[np.unique(np.linspace(0, len(own) - 1, min(len(own), _POINTS_A_LINE)).astype(int))])
-    return np.concatenate(chosen) if chosen else np.zeros(0, np.intp)
+class _State(NamedTuple):
+    """Unknowns as things: camera, sheets (S, 4), shape of the board, poses (n, 6)."""
+
+    camera: Camera
+    sheets: Array
+    shape: Shape
+    poses: Array
 
 
-def first_camera(
-    corners: Sequence[tuple[Array, Array]], size: tuple[int, int], model: Model, free: Sequence[str]
-) -> Camera:
-    """Interior orientation by OpenCV's own calibration, from board points (N, 3) and pixels (N, 2) of each image.
-
-    Parameters
-    ----------
-    size : width and height. free : names that the adjustment estimates; other distortion is left at zero.
-    """
-    board = [np.ascontiguousarray(X, np.float32).reshape(-1, 1, 3) for X, _ in corners]
-    pixels = [np.ascontiguousarray(uv, np.float32).reshape(-1, 1, 2) for _, uv in corners]
-    width, height = size
-    if model == "fisheye":
-        flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
-        K, D = np.eye(3), np.zeros((4, 1))
-        wide = [part.astype(np.float64) for part in board], [part.astype(np.float64) for part in pixels]
-        _, K, D, _, _ = cv2.fisheye.calibrate(*wide, size, K, D, flags=flags)
-        distortion = D.ravel()
-    else:
-        flags = cv2.CALIB_FIX_K3 | cv2.CALIB_USE_LU
-        _, K, D, _, _ = cv2.calibrateCamera(board, pixels, size, np.eye(3), np.zeros(5), flags=flags)
-        distortion = D.ravel()[:5]
-    names = _DISTORTION["fisheye" if model == "fisheye" else "brown"]
-    distortion = [float(v) if name in free else 0.0 for name, v in zip(names, distortion, strict=True)]
-    return Camera(
-        model="fisheye" if model == "fisheye" else "brown",
-        width=width,
-        height=height,
-        fx=float(K[0, 0]),
-        fy=float(K[1, 1]),
-        cx=float(K[0, 2]),
-        cy=float(K[1, 2]),
-        distortion=tuple(distortion),
-    )
-
-
-def first_poses(camera: Camera, corners: Sequence[tuple[Array, Array]]) -> Array:
-    """Rotation vector and translation (n, 6), board to camera, of each image, by OpenCV's solvePnP on slopes."""
-    poses = []
-    for X, uv in corners:
-        origin, direction = rays(camera, uv)
-        # behind a flat port the rays' origins are off the centre by centimetres at most: good to begin with
-        slopes = np.ascontiguousarray(direction[:, :2] / direction[:, 2:]).reshape(-1, 1, 2)
-        _, rotation, translation = cv2.solvePnP(np.ascontiguousarray(X), slopes, np.eye(3), None)
-        shift = origin.mean(axis=0)
-        poses.append(np.concatenate([rotation.ravel(), translation.ravel() + shift * (camera.port is not None)]))
-    return np.array(poses, float)
-
-
-def calibrate_board(data: BoardData, camera: Camera, free: Sequence[str]) -> BoardResult:
+def calibrate_board(data: BoardData, camera: Camera, free: Sequence[str], bent: bool = False) -> BoardResult:
     """One adjustment of camera, board poses and sheets; sigmas and outliers found in turns.
 
     Parameters
@@ -167,30 +124,70 @@ def calibrate_board(data: BoardData, camera: Camera, free: Sequence[str]) -> Boa
     data : corners and light.
     camera : where to begin, as by `first_camera`, or a camera that is known.
     free : which of its numbers to estimate, as `camera_names` names them; none of a camera that is known.
+    bent : whether the board may not be flat: its shape, one smooth surface in all images, is estimated with the rest,
+        and the places of its corners.
     """
-    names = (*_PINHOLE, *_DISTORTION[camera.model])
+    names = (*_PINHOLE, *DISTORTION[camera.model])
     poses = first_poses(camera, _by_image(data))
-    problem = _Problem(data, camera, names, tuple(free), (), np.zeros(0), _CORNER_SIGMA_PX, 1.0)
-    light = _on_board(camera, poses, data)
+    problem = _Problem(data, camera, names, tuple(free), (), np.zeros(0), _CORNER_SIGMA_PX, 1.0, FLAT)
+    light = _on_board(_State(camera, np.zeros((0, 4)), FLAT, poses), data)
     count = int(data.laser_sheet.max(initial=-1)) + 1
-    starts = tuple(_first_sheet(str(s), light[data.laser_sheet == s]) for s in range(count))
-    problem = problem._replace(starts=starts)
-    x = np.concatenate([np.zeros(len(names) + 3 * count), poses.ravel()])
+    starts = tuple(first_sheet(str(s), light[data.laser_sheet == s]) for s in range(count))
+    shape = around(_seen(data, poses, light)) if bent else FLAT
+    problem = problem._replace(starts=starts, shape=shape)
+    x = np.concatenate([np.zeros(len(names) + 3 * count + len(shape.terms)), poses.ravel()])
     corner_used, laser_used = np.ones(len(data.corner_uv), bool), np.ones(len(data.laser_uv), bool)
     chosen, solved = problem, None
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS_BENT if bent else _ROUNDS):
         problem = problem._replace(per_px=_per_px(x, problem))
         chosen = _chosen(problem, corner_used, laser_used)
         solved = solve(lambda x, p=chosen: _residuals(x, p), x, _layout(chosen), _rows(chosen))
         x = solved.x
         corner, laser = _groups(chosen)
-        sigma = np.clip(problem.corner_sigma * unit_sigma(solved, corner), 0.005, 5)
-        factor = np.clip(problem.laser_sigma * unit_sigma(solved, laser), 0.05, 50) if laser.any() else 1.0
+        sigma = np.clip(problem.corner_sigma * unit_sigma(solved, corner), _BEST_CORNER_PX, 5)
+        factor = 1.0
+        if laser.any():
+            unit = unit_sigma(solved, laser) * _alike(solved.residual[laser], chosen.data)
+            factor = np.clip(problem.laser_sigma * unit, 0.05, 50)
         problem = problem._replace(corner_sigma=float(sigma), laser_sigma=float(factor))
         corner_off, laser_off = _misfits(x, problem)
         corner_used, laser_used = _within(np.hypot(*corner_off.T)), _within(np.abs(laser_off))
+        if bent:
+            problem = problem._replace(data=_released(problem, x, corner_off, corner_used, data.corner_board))
     assert solved is not None
     return _result(x, solved, problem, corner_used, laser_used)
+
+
+def _released(p: _Problem, x: Array, off: Array, used: NDArray[np.bool_], printed: Array) -> BoardData:
+    """The data with every corner of the board moved to where all images together have it.
+
+    As Strobl and Hirzinger 2011 (and cv2.calibrateCameraRO) release the target, but with the printed places as a
+    prior, so that scale and pose of the board stay. The light has no say in it.
+
+    Parameters
+    ----------
+    off : (P, 2) pixels, projected minus seen. used : (P,). printed : (P, 3) metres, before any release.
+    """
+    state, d = _unpacked(x, p), p.data
+    J = np.stack([_corners(state, d, step) - _corners(state, d, -step) for step in _NUDGE_M * np.eye(3)], axis=2)
+    J = np.nan_to_num(J / (2 * _NUDGE_M)) * used[:, None, None]
+    places, number = np.unique(printed, axis=0, return_inverse=True)
+    now = np.zeros_like(places)
+    now[number] = d.corner_board - printed
+    normal, right = np.zeros((len(places), 3, 3)), np.zeros((len(places), 3))
+    np.add.at(normal, number, np.einsum("pki,pkj->pij", J, J))
+    np.add.at(right, number, np.einsum("pki,pkj,pj->pi", J, J, now[number]) - np.einsum("pki,pk->pi", J, off))
+    prior = (p.corner_sigma / (_PRINTED * float(np.min(pdist(places))))) ** 2 * np.eye(3)
+    return d._replace(corner_board=printed + np.linalg.solve(normal + prior, right[..., None])[number, :, 0])
+
+
+def _alike(residual: Array, data: BoardData) -> float:
+    """By how much neighbours on a line that err alike (at the edges of squares, on a bent board) widen their sigma."""
+    same = (np.diff(data.laser_image) == 0) & (np.diff(data.laser_sheet) == 0)
+    product = float((residual[1:] * residual[:-1])[same].sum())
+    correlation = product / max(float((residual[1:] ** 2)[same].sum()), 1e-12)
+    correlation = float(np.clip(correlation, 0.0, _MOST_ALIKE))
+    return float(np.sqrt((1 + correlation) / (1 - correlation)))
 
 
 def _within(off: Array) -> NDArray[np.bool_]:
@@ -203,42 +200,34 @@ def _by_image(data: BoardData) -> list[tuple[Array, Array]]:
     return [(data.corner_board[o], data.corner_uv[o]) for o in own]
 
 
-def _first_sheet(name: str, X: Array) -> SheetBasis:
-    """The plane nearest to points (N, 3): total least squares, twice, without what is far off."""
-    keep = np.isfinite(X).all(1)
-    centre, normal = X[keep].mean(0), np.zeros(3)
-    for _ in range(3):
-        centre = X[keep].mean(0)
-        normal = np.linalg.svd(X[keep] - centre, full_matrices=False)[2][2]
-        off = np.abs((X - centre) @ normal)
-        keep = off < max(4 * 1.4826 * float(np.nanmedian(off)), 1e-9)
-    normal = normal * (1.0 if normal @ centre >= 0 else -1.0)
-    first = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
-    first /= np.linalg.norm(first)
-    return SheetBasis(name, centre, normal, np.stack([first, np.cross(normal, first)]))
+def _in_board(data: BoardData, poses: Array, light: Array) -> Array:
+    """The light (L, 3), metres, from the camera's to the board's frame."""
+    R = Rotation.from_rotvec(poses[:, :3]).as_matrix()[data.laser_image]
+    return np.einsum("pji,pj->pi", R, light - poses[data.laser_image, 3:])
 
 
-def fit_sheet(X: Array) -> Array:
-    """Normal and offset (4,) of the plane nearest to points (N, 3), outliers left out."""
-    start = _first_sheet("", X)
-    return moved(start, np.zeros(3))
+def _seen(data: BoardData, poses: Array, light: Array) -> Array:
+    """Where corners and light are on the board (N, 2), metres."""
+    on_board = _in_board(data, poses, light)
+    return np.concatenate([data.corner_board[:, :2], on_board[np.isfinite(on_board).all(1), :2]])
 
 
 def _layout(p: _Problem) -> Layout:
     scale = [_SCALE.get(name, 0.05) * (1.0 if name in p.free else _HELD) for name in p.names]
     sheet = [0.01, 0.01, 0.005] * len(p.starts)
+    bend = [_BEND * p.shape.size_m] * len(p.shape.terms)
     image = np.tile([0.01, 0.01, 0.01, 0.005, 0.005, 0.005], p.data.images)
-    return Layout(len(scale) + len(sheet), p.data.images, 6, np.concatenate([scale, sheet, image]))
+    return Layout(len(scale) + len(sheet) + len(bend), p.data.images, 6, np.concatenate([scale, sheet, bend, image]))
 
 
 def _rows(p: _Problem) -> Indices:
-    held = len(p.names)
+    held = len(p.names) + len(p.shape.terms)
     own = np.concatenate([np.repeat(p.data.corner_image, 2), p.data.laser_image, np.full(held, -1)])
     return np.column_stack([own, np.full(len(own), -1)])
 
 
 def _groups(p: _Problem) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    number = np.arange(2 * len(p.data.corner_uv) + len(p.data.laser_uv) + len(p.names))
+    number = np.arange(2 * len(p.data.corner_uv) + len(p.data.laser_uv) + len(p.names) + len(p.shape.terms))
     corner = number < 2 * len(p.data.corner_uv)
     return corner, ~corner & (number < 2 * len(p.data.corner_uv) + len(p.data.laser_uv))
 
@@ -258,95 +247,99 @@ def _chosen(p: _Problem, corner: NDArray[np.bool_], laser: NDArray[np.bool_]) ->
     return p._replace(data=kept, per_px=p.per_px[laser])
 
 
-def _unpacked(x: Array, p: _Problem) -> tuple[Camera, Array, Array]:
-    """Camera, sheets (S, 4) and poses (n, 6)."""
+def _unpacked(x: Array, p: _Problem) -> _State:
     shared, images = _layout(p).split(x)
     start = dict(zip(p.names, (p.camera.fx, p.camera.fy, p.camera.cx, p.camera.cy, *_padded(p.camera)), strict=True))
-    value = {name: start[name] + step for name, step in zip(p.names, shared, strict=False)}
+    value = {name: float(start[name] + step) for name, step in zip(p.names, shared, strict=False)}
     camera = p.camera.model_copy(
         update={
             **{name: value[name] for name in _PINHOLE},
             "distortion": tuple(value[name] for name in p.names[len(_PINHOLE) :]),
         }
     )
-    steps = shared[len(p.names) :].reshape(-1, 3)
-    sheets = [moved(start, step) for start, step in zip(p.starts, steps, strict=True)]
-    return camera, np.array(sheets).reshape(-1, 4), images
+    steps, terms = np.split(shared[len(p.names) :], [3 * len(p.starts)])
+    sheets = [moved(start, step) for start, step in zip(p.starts, steps.reshape(-1, 3), strict=True)]
+    return _State(camera, np.array(sheets).reshape(-1, 4), p.shape._replace(terms=terms), images)
 
 
 def _padded(camera: Camera) -> tuple[float, ...]:
-    size = len(_DISTORTION[camera.model])
+    size = len(DISTORTION[camera.model])
     return (*camera.distortion, *[0.0] * (size - len(camera.distortion)))
 
 
-def _board_planes(poses: Array) -> Array:
-    """Normals and offsets (n, 4) of the board in the camera frame."""
-    normal = Rotation.from_rotvec(poses[:, :3]).as_matrix()[:, :, 2]
-    return np.column_stack([normal, (normal * poses[:, 3:]).sum(1)])
-
-
-def _on_board(camera: Camera, poses: Array, data: BoardData, shift_px: float = 0.0) -> Array:
-    """The light (L, 3) on the board's plane, camera frame."""
+def _on_board(state: _State, data: BoardData, shift_px: float = 0.0) -> Array:
+    """The light (L, 3) on the board, camera frame."""
     if not len(data.laser_uv):
         return np.zeros((0, 3))
-    origin, direction = rays(camera, data.laser_uv + np.array([shift_px, 0.0]))
-    return cast_rays(origin, direction, _board_planes(poses)[data.laser_image])
+    origin, direction = rays(state.camera, data.laser_uv + np.array([shift_px, 0.0]))
+    R = Rotation.from_rotvec(state.poses[:, :3]).as_matrix()[data.laser_image]
+    t = state.poses[data.laser_image, 3:]
+    X = meet(state.shape, np.einsum("pji,pj->pi", R, origin - t), np.einsum("pji,pj->pi", R, direction))
+    return np.einsum("pij,pj->pi", R, X) + t
 
 
-def _gaps(camera: Camera, sheets: Array, poses: Array, data: BoardData, shift_px: float = 0.0) -> Array:
+def _gaps(state: _State, data: BoardData, shift_px: float = 0.0) -> Array:
     """Distances (L,) of the light on the board from its sheet, metres."""
     if not len(data.laser_uv):
         return np.zeros(0)
-    own = sheets[data.laser_sheet]
-    return (_on_board(camera, poses, data, shift_px) * own[:, :3]).sum(1) - own[:, 3]
+    own = state.sheets[data.laser_sheet]
+    return (_on_board(state, data, shift_px) * own[:, :3]).sum(1) - own[:, 3]
 
 
 def _per_px(x: Array, p: _Problem) -> Array:
     """Change (L,) of the gaps by one pixel along the row, metres."""
-    camera, sheets, poses = _unpacked(x, p)
-    change = _gaps(camera, sheets, poses, p.data, 0.5) - _gaps(camera, sheets, poses, p.data, -0.5)
-    return np.maximum(np.abs(change), 1e-9)
+    state = _unpacked(x, p)
+    return np.maximum(np.abs(_gaps(state, p.data, 0.5) - _gaps(state, p.data, -0.5)), 1e-9)
+
+
+def _corners(state: _State, data: BoardData, step: Array | None = None) -> Array:
+    """Pixels (P, 2) of the corners, all of them moved on the board by `step` (3,), metres."""
+    R = Rotation.from_rotvec(state.poses[:, :3]).as_matrix()[data.corner_image]
+    on_board = data.corner_board + (0.0 if step is None else step)
+    bend = heights(state.shape, data.corner_board[:, :2])[:, None] * np.array([0.0, 0.0, 1.0])
+    return project(state.camera, np.einsum("pij,pj->pi", R, on_board + bend) + state.poses[data.corner_image, 3:])
 
 
 def _misfits(x: Array, p: _Problem) -> tuple[Array, Array]:
     """Corners (P, 2), pixels, and gaps (L,), in stated sigmas."""
-    camera, sheets, poses = _unpacked(x, p)
-    R = Rotation.from_rotvec(poses[:, :3]).as_matrix()[p.data.corner_image]
-    X = np.einsum("pij,pj->pi", R, p.data.corner_board) + poses[p.data.corner_image, 3:]
-    gaps = _gaps(camera, sheets, poses, p.data)
-    return np.nan_to_num(project(camera, X) - p.data.corner_uv, nan=1e3), gaps / (p.per_px * p.data.laser_sigma_px)
+    state = _unpacked(x, p)
+    off = np.nan_to_num(_corners(state, p.data) - p.data.corner_uv, nan=1e3)
+    return off, _gaps(state, p.data) / (p.per_px * p.data.laser_sigma_px)
 
 
 def _residuals(x: Array, p: _Problem) -> Array:
     corner, laser = _misfits(x, p)
-    scale = _layout(p).scale[: len(p.names)]
+    layout = _layout(p)
     hold = np.array([0.01 if name in p.free else 1.0 for name in p.names])
-    held = x[: len(p.names)] / scale * hold
-    return np.concatenate([corner.ravel() / p.corner_sigma, laser / p.laser_sigma, held])
+    held = x[: len(p.names)] / layout.scale[: len(p.names)] * hold
+    bend = slice(layout.shared - len(p.shape.terms), layout.shared)
+    return np.concatenate([corner.ravel() / p.corner_sigma, laser / p.laser_sigma, held, x[bend] / layout.scale[bend]])
 
 
 def _result(x: Array, solved: Solved, p: _Problem, corner_used: NDArray, laser_used: NDArray) -> BoardResult:
-    camera, sheets, poses = _unpacked(x, p)
+    state = _unpacked(x, p)
     corner, _ = _misfits(x, p)
-    light = _on_board(camera, poses, p.data)
+    light = _on_board(state, p.data)
     size = len(p.names) + 3 * len(p.starts)
-    left_out, left_out_m = _left_out(x, p, corner_used, laser_used)
+    left_out, left_out_m, others = _left_out(x, p, corner_used, laser_used)
     steps = x[len(p.names) : size]
     covariance = solved.covariance[:size, :size]
-    wide = _widened(covariance, left_out, sheets, p.starts, len(p.names))
+    wide = _widened(covariance, others[:, :size])
     ranges = [light[laser_used & (p.data.laser_image == k)] for k in range(p.data.images)]
     return BoardResult(
-        camera=camera,
+        camera=state.camera,
         camera_names=p.names,
-        R_camera_board=Rotation.from_rotvec(poses[:, :3]).as_matrix(),
-        t_camera_board=poses[:, 3:],
-        sheets=sheets,
+        R_camera_board=Rotation.from_rotvec(state.poses[:, :3]).as_matrix(),
+        t_camera_board=state.poses[:, 3:],
+        shape=state.shape,
+        sheets=state.sheets,
         starts=p.starts,
         steps=steps,
         covariance=wide,
         corner_residual_px=corner,
         corner_used=corner_used,
-        laser_residual_m=_gaps(camera, sheets, poses, p.data),
+        laser_residual_m=_gaps(state, p.data),
+        light_on_board=_in_board(p.data, state.poses, light),
         laser_used=laser_used,
         corner_sigma_px=p.corner_sigma,
         laser_sigma=p.laser_sigma,
@@ -356,54 +349,57 @@ def _result(x: Array, solved: Solved, p: _Problem, corner_used: NDArray, laser_u
     )
 
 
-def _without(x: Array, p: _Problem, corner: NDArray, laser: NDArray, image: int) -> tuple[Camera, Array, Array]:
-    """Camera, sheets and poses of an adjustment that knows nothing of the light in one image."""
+def _without(x: Array, p: _Problem, corner: NDArray, laser: NDArray, image: int) -> tuple[_State, Array]:
+    """What an adjustment finds, and its shared unknowns, that knows nothing of the light in one image."""
     chosen = _chosen(p, corner, laser & (p.data.laser_image != image))
     solved = solve(lambda y: _residuals(y, chosen), x, _layout(chosen), _rows(chosen))
-    return _unpacked(solved.x, chosen)
+    return _unpacked(solved.x, chosen), _layout(chosen).split(solved.x)[0]
 
 
-def _left_out(x: Array, p: _Problem, corner: NDArray, laser: NDArray) -> tuple[Array, Array]:
-    """Sheets (n, S, 4) without the light of each image, and what they are off by on it (n, S).
+def _left_out(x: Array, p: _Problem, corner: NDArray, laser: NDArray) -> tuple[Array, Array, Array]:
+    """Sheets (n, S, 4) without the light of each image, what they are off by on it (n, S), and what is shared (n, K).
 
-    The latter is the rms distance, metres, along the board's normal, of the image's light, triangulated with these
-    sheets, from the board as its corners alone have it. NaN where too little is left to tell.
+    The second is the rms distance, metres, across the board, of the image's light, triangulated with these sheets,
+    from the board as its corners alone place it. NaN where too little is left to tell.
     """
     count, lit = len(p.starts), p.data.laser_image
     sheets, rms = np.full((p.data.images, count, 4), np.nan), np.full((p.data.images, count), np.nan)
+    shared = np.full((p.data.images, _layout(p).shared), np.nan)
     for k in np.unique(lit[laser]):
-        camera, others, poses = _without(x, p, corner, laser, int(k))
-        board = _board_planes(poses)[k]
+        state, found = _without(x, p, corner, laser, int(k))
         for s in range(count):
             own = laser & (p.data.laser_sheet == s)
             if len(np.unique(lit[own & (lit != k)])) < 2:
                 continue
-            sheets[k, s] = others[s]
+            sheets[k, s] = state.sheets[s]
             here = own & (lit == k)
             if here.any():
-                X = cast_rays(*rays(camera, p.data.laser_uv[here]), others[s])
-                rms[k, s] = float(np.sqrt(np.mean((X @ board[:3] - board[3]) ** 2)))
-    return sheets, rms
+                X = cast_rays(*rays(state.camera, p.data.laser_uv[here]), state.sheets[s])
+                rms[k, s] = float(np.sqrt(np.mean(_above(state, int(k), X) ** 2)))
+        # a sheet that fewer than two other images have is nowhere without this one, and would speak for no scatter
+        shared[k] = found
+        lost = np.isnan(sheets[k]).any(1)
+        shared[k, len(p.names) : len(p.names) + 3 * count][np.repeat(lost, 3)] = np.nan
+    return sheets, rms, shared
 
 
-def _widened(covariance: Array, left_out: Array, sheets: Array, starts: Sequence[SheetBasis], first: int) -> Array:
-    """The covariance with each sheet's rows scaled up to the jackknife's variance where that is larger.
+def _above(state: _State, image: int, X: Array) -> Array:
+    """Distance (N,) of points (N, 3), camera frame, from the board of an image, along the axis of its frame."""
+    pose = state.poses[image]
+    on_board = Rotation.from_rotvec(pose[:3]).inv().apply(X - pose[3:])
+    return on_board[:, 2] - heights(state.shape, on_board[:, :2])
 
-    Errors that all points of an image share (a bent board, glare) do not show in the residuals, but in how much the
-    sheets change when an image is left out.
+
+def _widened(covariance: Array, left_out: Array) -> Array:
+    """The covariance (K, K) scaled up to the jackknife's variances where these are larger.
+
+    Errors that all points of an image share (a bent board, glare) do not show in the residuals, but in how much camera
+    and sheets change when the light of an image is left out: left_out (n, K), NaN where that says nothing.
     """
     factor = np.ones(len(covariance))
-    for s, start in enumerate(starts):
-        known = np.isfinite(left_out[:, s]).all(1)
-        count = int(known.sum())
-        if count < 4:
-            continue
-        sign = np.sign(left_out[known, s, :3] @ sheets[s, :3])
-        others = left_out[known, s] * sign[:, None]
-        turn = (others[:, :3] - sheets[s, :3]) @ start.tangents.T
-        shift = others[:, 3] - others[:, :3] @ start.anchor
-        steps = np.column_stack([turn, shift])
-        variance = (count - 1) * np.mean((steps - steps.mean(0)) ** 2, axis=0)
-        own = slice(first + 3 * s, first + 3 * s + 3)
-        factor[own] = np.sqrt(np.maximum(variance / np.diag(covariance)[own], 1.0))
+    for k, values in enumerate(left_out.T):
+        known = values[np.isfinite(values)]
+        if len(known) >= _LEAST_LEFT_OUT and covariance[k, k] > 0:
+            variance = (len(known) - 1) * float(known.var())
+            factor[k] = np.sqrt(max(variance / covariance[k, k], 1.0))
     return covariance * np.outer(factor, factor)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ..schemas.calibration import Camera, Laser
-from .calibration_board import fit_sheet
+from .calibration_board_start import fit_sheet
 from .calibration_sheets import cast_rays, line_on_floor
 from .camera import normalised, outline, project, rays
 

@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 # A Gaussian line of 100 grey levels is below one half at 3.3 sigma.
 _REACH_SIGMAS = 3.3
 _LEAST_NEAR = 8
+_MOST_ALIKE = 0.95  # correlation of neighbours beyond which a line is too short to tell
+_BESIDE_PX = 20.0
 
 
 class Soundings(NamedTuple):
@@ -127,7 +129,8 @@ class Agreement(NamedTuple):
     Attributes
     ----------
     gap_m : how much deeper arm b has the bottom there than arm a, metres.
-    sigma_m : its 1-sigma, from the scatter of the soundings about their straight lines.
+    sigma_m : its 1-sigma, from the scatter of the soundings about their straight lines, and from how much
+        neighbours are alike in it: a bump makes many soundings err together.
     """
 
     gap_m: float
@@ -267,5 +270,7 @@ def _value_at_zero(along: Array, depth: Array) -> tuple[float, float]:
     """Depth at 0 of the straight line through points (N,), and its 1-sigma."""
     design = np.column_stack([np.ones(len(along)), along])
     value, *_ = np.linalg.lstsq(design, depth, rcond=None)
-    scatter = (depth - design @ value).std()
+    off = (depth - design @ value)[np.argsort(along, kind="stable")]
+    alike = float(np.clip((off[1:] * off[:-1]).sum() / max((off**2).sum(), 1e-18), 0.0, _MOST_ALIKE))
+    scatter = off.std() * np.sqrt((1 + alike) / (1 - alike))
     return float(value[0]), float(scatter * np.sqrt(np.linalg.inv(design.T @ design)[0, 0]))

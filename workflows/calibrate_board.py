@@ -1,6 +1,6 @@
 """`seamosaic calibrate board`: photographs of a chessboard or ChArUco board with the laser on it, or beside it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
@@ -13,12 +13,15 @@ from ..schemas.calibration import Calibration, Camera, Laser, Mount
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..tasks import calibration_board as adjusting
+from ..tasks import calibration_board_start as starting
 from ..tasks import calibration_targets as targets
+from ..tasks.board_shape import heights
 from ..tasks.calibration_lines import cross_on_flat
 from ..tasks.calibration_sheets import as_plane, basis, block, sheet_names, step_jacobian
 from . import calibrate
 from . import calibration_report as report
 from .job import log
+from .progress import progress
 
 Array = NDArray[np.float64]
 Lines = Literal["cross"] | int
@@ -43,7 +46,7 @@ class BoardSetup(NamedTuple):
     board : the target. lines : cross, or how many lines run from top to bottom without crossing.
     beside : the light lies beside the board, on the surface to which it is fixed, rather than on it.
     start : camera (held if `hold_camera`), sheets and mount to start from, or None.
-    model : of the camera where there is no start.
+    model : of the camera where there is no start. bent : whether the board's shape is estimated too.
     """
 
     board: targets.Board
@@ -51,7 +54,8 @@ class BoardSetup(NamedTuple):
     beside: bool
     start: Calibration | None
     hold_camera: bool
-    model: adjusting.Model
+    model: starting.Model
+    bent: bool = False
 
 
 class _Seen(NamedTuple):
@@ -76,21 +80,21 @@ def run_board(folder: Path, out: Path, setup: BoardSetup, parameters: Parameters
     seen = _look(folder, setup, parameters)
     camera = _first_camera(seen, setup)
     free = () if setup.hold_camera else _free(camera.model, len(seen.names))
-    found = adjusting.calibrate_board(_data(seen), camera, free)
+    found = adjusting.calibrate_board(_data(seen), camera, free, setup.bent)
     result = _calibration(found, setup)
     if result.laser is None and len(found.sheets):
         _write_planes(out / PLANES, found)
     return calibrate.write(out, result, _page(folder, seen, setup, found, free, result))
 
 
-def _free(model: adjusting.Model, images: int) -> tuple[str, ...]:
+def _free(model: starting.Model, images: int) -> tuple[str, ...]:
     free = _FREE[model]
     return tuple(name for name in free if images >= _FEW or name not in ("p1", "p2"))
 
 
 def _first_camera(seen: _Seen, setup: BoardSetup) -> Camera:
     if setup.start is None:
-        return adjusting.first_camera(seen.corners, seen.size, setup.model, _free(setup.model, len(seen.names)))
+        return starting.first_camera(seen.corners, seen.size, setup.model, _free(setup.model, len(seen.names)))
     camera = setup.start.camera
     if (camera.width, camera.height) != seen.size:
         found, expected = f"{seen.size[0]} x {seen.size[1]}", f"{camera.width} x {camera.height} pixels"
@@ -104,22 +108,30 @@ def _look(folder: Path, setup: BoardSetup, parameters: Parameters) -> _Seen:
         remedy = "Give the folder that holds the photographs."
         raise InvalidInput([Problem(str(folder), None, "", "no images", "JPEG, PNG or TIFF images", remedy)])
     names, corners, light, sizes = [], [], [], []
-    for path in paths:
+    for path in _shown(paths, folder.name):
         image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             log.warning("step=calibrate image=%s rejected: it cannot be decoded", path.name)
             continue
         bgr = np.asarray(image, np.uint8)
-        board = targets.corners(np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8), setup.board)
+        board = targets.corners(targets.without_light(bgr), setup.board)
         if board is None:
             log.warning("step=calibrate image=%s rejected: no board found", path.name)
             continue
         names.append(path.name)
-        corners.append(board)
-        sizes.append((bgr.shape[1], bgr.shape[0]))
         light.append(_light(bgr, board[1], setup, parameters))
+        corners.append(targets.clear_of(board, light[-1].uv))
+        sizes.append((bgr.shape[1], bgr.shape[0]))
     _enough(folder, setup, names, sizes, light)
     return _Seen(tuple(names), corners, light, sizes[0])
+
+
+def _shown(paths: Sequence[Path], name: str) -> Iterator[Path]:
+    """The paths one by one, and how far they are."""
+    with progress(name, "photographs", len(paths)) as advance:
+        for path in paths:
+            yield path
+            advance(1)
 
 
 def _enough(folder: Path, setup: BoardSetup, names: list, sizes: list, light: list[targets.Light]) -> None:
@@ -153,7 +165,7 @@ def _light(bgr: NDArray[np.uint8], corner_uv: Array, setup: BoardSetup, paramete
 
 
 def _data(seen: _Seen) -> adjusting.BoardData:
-    chosen = [adjusting.thinned(one.uv, one.sheet, one.sigma_px) for one in seen.light]
+    chosen = [starting.thinned(one.uv, one.sheet, one.sigma_px) for one in seen.light]
     light = [(one.uv[c], one.sheet[c], one.sigma_px[c]) for one, c in zip(seen.light, chosen, strict=True)]
     number = np.arange(len(seen.names))
     return adjusting.BoardData(
@@ -263,6 +275,8 @@ def _page(
         ("Ranges", f"{np.nanmin(found.range_m):.3f} to {np.nanmax(found.range_m):.3f} m"),
         ("Left-out light from the board, rms", f"{1e3 * rms:.3f} mm: {share:.3f} mm per 300 mm of range"),
     )
+    if setup.bent:
+        facts = (*facts, ("Shape of the board", _shape(data, found)))
     rows = _rows(found, free, result)
     figures = [
         report.picture("Residuals of the corners", residuals, "Projected minus seen."),
@@ -287,6 +301,14 @@ def _page(
         pictures=tuple(figures),
         warnings=tuple(_warnings(seen, found)),
     )
+
+
+def _shape(data: adjusting.BoardData, found: adjusting.BoardResult) -> str:
+    """How far the board is from flat where its corners are, and where light was."""
+    corners = heights(found.shape, data.corner_board[:, :2])
+    light = heights(found.shape, found.light_on_board[found.laser_used, :2])
+    low, high = (1e3 * float(f(np.concatenate([corners, light]))) for f in (np.min, np.max))
+    return f"{low:+.2f} to {high:+.2f} mm from flat, over the corners and the light"
 
 
 def _port(result: Calibration, found: adjusting.BoardResult, figures: list[report.Figured]) -> list[str]:
@@ -325,5 +347,8 @@ def _warnings(seen: _Seen, found: adjusting.BoardResult) -> list[str]:
     if covered.min() < 0.6:
         said.append("the board was never shown near the edges of the image: distortion there is a guess")
     if found.corner_sigma_px > 0.3:
-        said.append(f"corners are off by {found.corner_sigma_px:.2f} px: is the board flat, sharp and evenly lit?")
+        remedy = "" if len(found.shape.terms) else "; --bent estimates its shape"
+        said.append(
+            f"corners are off by {found.corner_sigma_px:.2f} px: is the board flat, sharp and evenly lit?{remedy}"
+        )
     return said

@@ -33,6 +33,15 @@ AltimeterOption = Annotated[
 ]
 
 
+@app.callback()
+def _begin(
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more of what is done.")] = False,
+) -> None:
+    from .progress import log_to_stderr
+
+    log_to_stderr(verbose)
+
+
 def _start(path: Path | None) -> Any:
     from .calibrate_inputs import read_calibration
 
@@ -53,10 +62,10 @@ def flat(
     """Sheets and mount angles over a pool's floor or a flat seabed, sailed at several altitudes."""
     from ..schemas.parameters import Parameters
     from ..tasks.calibration_flat import Priors
-    from . import calibrate
+    from .calibrate_flat import run_flat
 
     priors = Priors(sheet_deg=sheet_deg, sheet_m=1e-3 * sheet_mm, altimeter_m=1e-3 * altimeter_mm)
-    _show(calibrate.run_flat(missions, out, _start(start), priors, Parameters(), boresight, images))
+    _show(run_flat(missions, out, _start(start), priors, Parameters(), boresight, images))
 
 
 @app.command()
@@ -76,6 +85,7 @@ def board(
     ] = None,
     hold_camera: Annotated[bool, typer.Option(help="Take the camera of --start as right.")] = False,
     model: Annotated[Literal["brown", "fisheye"], typer.Option(help="Camera where there is no --start.")] = "brown",
+    bent: Annotated[bool, typer.Option(help="The board may not be flat: estimate its shape too.")] = False,
 ) -> None:
     """Camera and sheets from photographs of a chessboard or ChArUco board in the laser's light."""
     import cv2
@@ -89,7 +99,7 @@ def board(
         remedy = "Write DICT_4X4_50, DICT_5X5_100 or another of OpenCV's."
         raise InvalidInput([Problem("--dictionary", None, "", dictionary, "a dictionary of markers", remedy)])
     target = Board(kind, columns, rows, 1e-3 * square_mm, marker_share, dictionary)
-    setup = calibrate_board.BoardSetup(target, _lines(lines, begun), beside, begun, hold_camera, model)
+    setup = calibrate_board.BoardSetup(target, _lines(lines, begun), beside, begun, hold_camera, model, bent)
     _show(calibrate_board.run_board(folder, out, setup, Parameters()))
 
 
@@ -106,10 +116,10 @@ def field(
     """Sheets, mount angles and the navigation's clock from the crossovers of an ordinary mission."""
     from ..schemas.parameters import Parameters
     from ..tasks.calibration_field import FieldPriors
-    from . import calibrate
+    from .calibrate_field import run_field
 
     priors = FieldPriors(sheet_deg=sheet_deg, sheet_m=1e-3 * sheet_mm, altimeter_m=1e-3 * altimeter_mm)
-    _show(calibrate.run_field(mission, out, _start(start), priors, Parameters(), images))
+    _show(run_field(mission, out, _start(start), priors, Parameters(), images))
 
 
 def _lines(text: str, start: Any) -> Any:

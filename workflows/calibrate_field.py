@@ -1,5 +1,6 @@
-"""`seamosaic calibrate field`: from an ordinary mission's own crossovers."""
+"""`seamosaic calibrate field`: from an ordinary mission's own crossovers, and its report."""
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -9,9 +10,11 @@ from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..tasks import calibration_crossovers as crossovers
 from ..tasks import calibration_field as field
-from ..tasks.calibration_sheets import as_plane, cast_rays
+from ..tasks.calibration_sheets import altitude_error, as_plane, cast_rays
 from ..tasks.camera import normalised, rays
+from . import calibrate
 from . import calibrate_inputs as inputs
+from . import calibration_report as report
 from .job import log
 
 _ROUNDS = 3
@@ -143,3 +146,123 @@ def _only_used(p: field.FieldProblem) -> field.FieldProblem:
         beside=p.beside._replace(point=number[p.beside.point]),
         feet=p.feet._replace(point=number[p.feet.point]),
     )
+
+
+def run_field(
+    mission: str,
+    out: Path,
+    start: Calibration | None,
+    priors: field.FieldPriors,
+    parameters: Parameters,
+    images: int = 60,
+) -> calibrate.Written:
+    """Calibrate from the crossovers of an ordinary mission.
+
+    Raises
+    ------
+    InvalidInput
+        The mission cannot be used, or its images hardly overlap.
+    """
+    calibrate.prepare(out)
+    outcome = calibrate_field(mission, start, priors, parameters, images)
+    found, begun = outcome.result, outcome.problem.calibration
+    own = outcome.problem.starts
+    sheets = calibrate.Sheets(own, found.sheets, found.shared[:6], found.covariance[:6, :6], found.prior_sigma[:6])
+    mount = Mount(translation=begun.mount.translation, rotation=tuple(found.mount_deg.tolist()))
+    result = begun.model_copy(
+        update={
+            "laser": calibrate.with_sheets(begun, sheets),
+            "mount": mount,
+            "covariance": calibrate.sheets_and_mount(begun, sheets, found.covariance, calibrate.MOUNT),
+        }
+    )
+    page = _field_page(mission, outcome.problem, found, sheets, result, priors, outcome.range_m)
+    return calibrate.write(out, result, page)
+
+
+def _field_rows(begun: Calibration, found: field.FieldResult, sheets: calibrate.Sheets) -> list[report.Row]:
+    sigma, prior = np.sqrt(np.diag(found.covariance)), found.prior_sigma
+    rows = calibrate.sheet_rows(sheets)
+    for k, name in enumerate(calibrate.MOUNT):
+        s, p = (float(np.degrees(v[6 + k])) for v in (sigma, prior))
+        rows.append(report.Row(f"mount {name}", "deg", float(found.mount_deg[k]), s, begun.mount.rotation[k], p))
+    rows.append(report.Row("time offset to add", "s", found.clock_s, float(sigma[9]), 0.0, float(prior[9])))
+    return rows
+
+
+def _field_page(
+    mission: str,
+    problem: field.FieldProblem,
+    found: field.FieldResult,
+    sheets: calibrate.Sheets,
+    result: Calibration,
+    priors: field.FieldPriors,
+    range_m: float,
+) -> report.Page:
+    camera = result.camera
+    rows = _field_rows(problem.calibration, found, sheets)
+    shown = calibrate.altitudes(0.8 * range_m, 1.2 * range_m)
+    said, figures = calibrate.port_parts(result, shown)
+    first = problem.points.arm[problem.crossings.p[:, 0]]
+    names = [f"sheet {s.name}" for s in problem.starts]
+    lit = found.used
+    heights = 1e3 * found.crossing_m
+    residuals = report.residual_map(
+        found.crossing_uv[lit], heights[lit], (camera.width, camera.height), first[lit], names, "mm"
+    )
+    facts = (
+        ("Mission", mission),
+        ("Images", f"{len(problem.track.time_s)}"),
+        ("Crossovers of laser lines", f"{found.counts['crossover']}"),
+        ("Their height differences, rms", f"{np.sqrt(np.mean(heights[lit] ** 2)):.2f} mm"),
+        ("Matches beside a line, matches in all", f"{found.counts['beside']}, {found.counts['match']}"),
+        ("Altimeter readings over a line", f"{found.counts['altimeter']}"),
+    )
+    said_clock = (
+        f"The navigation's clock: {found.clock_s:+.3f} s is to be added to navigation.time_offset in mission.yaml "
+        f"(± {np.sqrt(found.covariance[9, 9]):.3f} s); it is no part of calibration.yaml."
+    )
+    return report.Page(
+        title="Calibration from crossovers",
+        way="Where lines of light of different images cross, they have to be at one height.",
+        facts=facts,
+        rows=tuple(rows),
+        statements=(
+            calibrate.accuracy_statement(result, sheets, shown),
+            *calibrate.verdicts(rows),
+            said_clock,
+            "Crossovers alone say nothing of the scale: it comes from the altimeter, whose constant error, with the "
+            f"lever arm's, was taken as {1e3 * priors.altimeter_m:.2g} mm (1-sigma) and goes into every altitude, and "
+            "from the lengths of the track.",
+            "Mount angles cannot be told from constant errors of the navigation's roll, pitch and heading; their sigma "
+            "includes those as the mission states them.",
+            *said,
+        ),
+        left_out_header=(
+            "Left out",
+            "crossovers",
+            "rms of those left out",
+            *(f"change of altitude by {n}" for n in names),
+        ),
+        left_out=tuple(_field_left_out(problem, found, range_m)),
+        pictures=(
+            report.picture("Crossovers in the image", residuals, "Height differences, at the first image's line."),
+            calibrate.sensitivity_picture(result, sheets, shown),
+            *figures,
+        ),
+    )
+
+
+def _field_left_out(problem: field.FieldProblem, full: field.FieldResult, range_m: float) -> list[report.LeftOut]:
+    """Every second crossover left out, in turn."""
+    lines, count = [], len(problem.crossings.f)
+    for turn, name in enumerate(("odd", "even")):
+        out = np.arange(count) % 2 == turn
+        c = problem.crossings
+        kept = field.Crossings(c.p[~out], c.q[~out], c.f[~out], c.g[~out])
+        found = field.adjust_field(problem._replace(crossings=kept, sigma=full.sigma), full.x, rounds=1)
+        off = field.heights_with(problem, found.x)[out & full.used]
+        change = [altitude_error(problem.calibration.camera, full.sheets[s], found.sheets[s], range_m) for s in (0, 1)]
+        rms = f"{1e3 * np.sqrt(np.mean(off**2)):.2f} mm"
+        lines.append(report.LeftOut(name, (f"{out.sum()}", rms, *(f"{1e3 * c:+.2f} mm" for c in change))))
+    return lines

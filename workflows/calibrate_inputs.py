@@ -1,8 +1,9 @@
 """What calibrations take from a mission: images, lines of light, navigation and matches."""
 
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import cv2
 import numpy as np
@@ -25,6 +26,9 @@ from ..tasks.calibration_lines import Lines, cross_on_flat, no_lines
 from ..tasks.rotations import R_vehicle_camera
 from . import match, plan
 from .job import Job, log
+from .progress import progress
+
+Result = TypeVar("Result")
 
 SMOOTH_S = 1.5
 _RATE_STEP_S = 0.25
@@ -113,6 +117,16 @@ def _read(survey: Survey, row: int) -> NDArray[np.uint8] | None:
         return None
 
 
+def _each(survey: Survey, step: str, measure: Callable[[Any], Result], wanted: Sequence[Any]) -> list[Result]:
+    """What `measure` makes of each of those wanted, two at a time, in their order; progress is shown."""
+    made = []
+    with progress(survey.opened.mission.id, step, len(wanted)) as advance, ThreadPoolExecutor(2) as pool:
+        for result in pool.map(measure, wanted):
+            made.append(result)
+            advance(1)
+    return made
+
+
 def flat_lines(survey: Survey, parameters: Parameters) -> list[Lines]:
     """Both lines of each image on a flat floor."""
     calibration = survey.opened.calibration
@@ -123,8 +137,7 @@ def flat_lines(survey: Survey, parameters: Parameters) -> list[Lines]:
         bgr = _read(survey, row)
         return no_lines() if bgr is None else cross_on_flat(bgr, calibration.camera, sheets, parameters.laser)
 
-    with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(one, survey.rows.tolist()))
+    return _each(survey, "lines", one, survey.rows.tolist())
 
 
 def _reference(survey: Survey) -> tuple[NDArray, NDArray]:
@@ -245,10 +258,8 @@ def soundings(survey: Survey, calibration: Calibration, parameters: Parameters) 
             return triangulation.no_soundings()
         return triangulation.sound(bgr, calibration.camera, light, parameters.laser).soundings
 
-    with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(one, survey.rows.tolist()))
     parts = []
-    for k, s in enumerate(found):
+    for k, s in enumerate(_each(survey, "soundings", one, survey.rows.tolist())):
         for arm in (0, 1):
             own = np.flatnonzero(s.arm == arm)
             own = own[np.argsort(s.uv[own, 1], kind="stable")][:: max(1, len(own) // _POINTS_AN_ARM)]
@@ -265,9 +276,10 @@ def matches(survey: Survey, parameters: Parameters) -> Matches:
     of_survey = made._replace(images=tuple(image for image in made.images if image.row in number))
     tasks = plan.first_pairs(of_survey, survey.opened, parameters)
     needed = sorted({row for task in tasks for row in (task.i, task.j)})
-    with ThreadPoolExecutor(2) as pool:
-        entries = dict(zip(needed, pool.map(lambda row: _entry(survey, row, parameters), needed), strict=True))
-        found = list(pool.map(lambda task: match.between(job, task, entries[task.i], entries[task.j]), tasks))
+    entries = dict(
+        zip(needed, _each(survey, "features", lambda row: _entry(survey, row, parameters), needed), strict=True)
+    )
+    found = _each(survey, "matches", lambda task: match.between(job, task, entries[task.i], entries[task.j]), tasks)
     linked = [(task, made_) for task, made_ in zip(tasks, found, strict=True) if made_.info["model"]]
     if not linked:
         none = np.zeros(0, np.intp)

@@ -1,20 +1,19 @@
 """The `seamosaic` command. Exit codes: 0 done, 1 failed, 2 invalid input."""
 
 import json
-import logging
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.logging import RichHandler
 from rich.table import Table
 from rich.text import Text
 
 from ..schemas.problems import InvalidInput
 from .calibrate_commands import app as calibrate_app
 from .job import log
+from .progress import log_to_stderr
 
 FAILED, INVALID = 1, 2
 
@@ -57,7 +56,7 @@ def run(
     """Process a mission: every product of one mission folder. What was computed before is not computed again."""
     from . import run as runner
 
-    _log_to_stderr(verbose)
+    log_to_stderr(verbose)
     result = runner.run(mission, out, _parameters(params, set_), scheduler, workers)
     _print_result(result)
 
@@ -111,7 +110,7 @@ def demo(out: Annotated[Path, typer.Argument(metavar="OUT", help="A new or an ea
     from . import run as runner
     from . import simulate as simulator
 
-    _log_to_stderr(False)
+    log_to_stderr(False)
     mission = out / "mission"
     if not mission.exists():
         _console.print("Making a small mission over a simulated reef ...")
@@ -174,16 +173,6 @@ def _figures(quality: Any):
         yield "bathymetry", f"{quality.bathymetry.area_m2:.1f} m², cells of {quality.bathymetry.cell_m:g} m"
     if quality.mosaic is not None:
         yield "mosaic", f"{quality.mosaic.area_m2:.1f} m², pixels of {1e3 * quality.mosaic.cell_m:g} mm"
-
-
-def _log_to_stderr(verbose: bool) -> None:
-    if sys.stderr.isatty():
-        handler: logging.Handler = RichHandler(console=_errors, show_path=False)
-    else:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    log.handlers = [handler]
-    log.setLevel(logging.DEBUG if verbose else logging.INFO)
 
 
 def main() -> None:

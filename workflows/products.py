@@ -21,7 +21,7 @@ from ..schemas.products import MeshQuality, Quality
 from ..schemas.provenance import InputFile, Provenance
 from ..tasks import mesh, rotations
 from ..tasks.grids import Bounds, Grid
-from . import extract, maps, mosaics, quality, report, report_figures
+from . import calibration_quality, extract, maps, mosaics, quality, report, report_figures
 from .job import code_version, load
 from .results import Results, span, vertical_reference
 from .solve import Solution
@@ -39,6 +39,7 @@ _VERSION = code_version(
     mesh,
     report,
     quality,
+    calibration_quality,
 )
 _MESH_CELLS = 2_000_000
 _NAMED_BY = ("image", "role", "time", "status", "sha256")
@@ -155,10 +156,13 @@ def _write_bathymetry(results: Results, folder: Path, crs_wkt: str) -> None:
     surface, opened = results.mapped.surface, results.opened
     tags = {"VERTICAL_REFERENCE": vertical_reference(opened), "MISSION": opened.mission.id}
     layers = {"bathymetry": "elevation", "uncertainty": "sigma", "density": "density", "source": "source"}
+    common = calibration_quality.median_sigma(results) or 0.0
     for product, layer in layers.items():
         with _writer(folder, f"{product}.tif", surface.grid, crs_wkt, tags) as file:
             for tile, done in surface.tiles:
-                file.write(*_inner(surface.grid, tile), load(results.job, maps.SURFACE, done.key).arrays[layer])
+                values = load(results.job, maps.SURFACE, done.key).arrays[layer]
+                # an error of the calibration is the same in all soundings: it goes to the sigma last, never averaged
+                file.write(*_inner(surface.grid, tile), np.hypot(values, common) if layer == "sigma" else values)
     reporting = opened.mission.reporting
     attributes = {
         "platform": opened.mission.platform,
@@ -195,6 +199,7 @@ def _write_soundings(results: Results, folder: Path, crs_wkt: str) -> int:
     grid, poses = results.mapped.surface.grid, results.posed.solution.poses
     west, south, _, _ = grid.bounds
     count, status = 0, _status(results)
+    error = calibration_quality.of_calibration(results.job)
     with pointclouds.SoundingsWriter(folder / "soundings.laz", crs_wkt, np.array([west, south, 0.0])) as file:
         for row, done in results.posed.extracted.items():
             if status[row].startswith("rejected") or not done.info["soundings"]:
@@ -202,7 +207,8 @@ def _write_soundings(results: Results, folder: Path, crs_wkt: str) -> int:
             arrays = load(results.job, extract.STEP, done.key).arrays
             X = arrays["laser_X"] @ poses.R_local_camera[row].T + poses.C_local[row]
             frame = np.full(len(X), row, np.int32)
-            file.write(results.plan.frame.map_from_local(X), frame, arrays["laser_arm"], arrays["laser_sigma"])
+            sigma = np.hypot(arrays["laser_sigma"], calibration_quality.soundings_sigma(error, dict(arrays)))
+            file.write(results.plan.frame.map_from_local(X), frame, arrays["laser_arm"], sigma)
             count += len(X)
     return count
 

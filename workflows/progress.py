@@ -1,16 +1,29 @@
 """Progress of long work: bars on a terminal, one line a minute in a log."""
 
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
+from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from .job import log
 
 _LOG_EVERY_S = 60.0
+
+
+def log_to_stderr(verbose: bool) -> None:
+    """Send the log to standard error: coloured on a terminal, plain lines elsewhere; details if verbose."""
+    if sys.stderr.isatty():
+        handler: logging.Handler = RichHandler(console=Console(stderr=True), show_path=False)
+    else:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    log.handlers = [handler]
+    log.setLevel(logging.DEBUG if verbose else logging.INFO)
 
 
 @contextmanager

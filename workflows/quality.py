@@ -22,6 +22,7 @@ from ..schemas.products import (
     SourceShares,
     TrajectoryQuality,
 )
+from . import calibration_quality
 from .results import Results, span, vertical_reference
 
 
@@ -39,6 +40,7 @@ def figures(
     folder : where the rasters are.
     """
     opened = results.opened
+    calibration = calibration_quality.measured(results)
     roles = Counter(str(role) for role in opened.frames["role"].values)
     start, end = span(opened)
     return Quality(
@@ -53,12 +55,17 @@ def figures(
             images=ImageCounts(total=len(rows), by_role=dict(roles), by_status=dict(Counter(row.kind for row in rows))),
         ),
         soundings=_sounding_quality(results, soundings),
+        calibration=calibration,
         pairs=_pair_quality(results),
         trajectory=_trajectory_quality(rows, navigation),
         bathymetry=_bathymetry_quality(folder, results.mapped.cell_m),
         mosaic=_mosaic_quality(results),
         mesh=triangles,
-        warnings=(*opened.warnings, *_doubts(rows, results)),
+        warnings=(
+            *opened.warnings,
+            *_doubts(rows, results),
+            *calibration_quality.doubts(calibration, calibration_quality.typical_range(results)),
+        ),
     )
 
 

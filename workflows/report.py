@@ -118,6 +118,7 @@ def _file_line(root: Path, name: str, description: str) -> FileLine:
 def _key_figures(quality: Quality) -> Iterator[KeyFigure]:
     yield from _image_figures(quality)
     yield from _sounding_figures(quality)
+    yield from _calibration_figures(quality)
     yield from _bathymetry_figures(quality)
     yield from _other_figures(quality)
 
@@ -170,6 +171,29 @@ def _sounding_figures(quality: Quality) -> Iterator[KeyFigure]:
             "Linked pairs of images",
             f"{pairs.linked:,} of {pairs.tried:,}",
             f"{pairs.homography:,} as flat ground, {pairs.essential:,} as relief{inliers}",
+        )
+
+
+def _calibration_figures(quality: Quality) -> Iterator[KeyFigure]:
+    found = quality.calibration
+    if found is None:
+        return
+    if found.sigma_m is not None:
+        meaning = "1-sigma that all soundings have in common; no averaging lessens it, and every cell's includes it"
+        yield KeyFigure("Error of the calibration", f"± {_length(found.sigma_m)}", meaning)
+    if found.laser_gap_m is not None and found.laser_gap_sigma_m is not None:
+        yield KeyFigure(
+            "Laser sheets where they meet",
+            f"{1000 * found.laser_gap_m:+.2f} ± {1000 * found.laser_gap_sigma_m:.2f} mm",
+            f"how much deeper arm b has the seabed than arm a, median of {found.laser_gap_images:,} images; "
+            "nothing if the calibration is right",
+        )
+    if found.pinhole_percent is not None:
+        yield KeyFigure(
+            "Had the flat port been ignored",
+            f"{found.pinhole_percent:+.2f} %",
+            "largest error of altitudes around these, with a pinhole camera and sheets fitted in water; this run "
+            "traced every ray through the port",
         )
 
 

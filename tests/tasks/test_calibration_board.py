@@ -2,7 +2,9 @@ import cv2
 import numpy as np
 import pytest
 from seamosaic.schemas.parameters import LaserParameters
+from seamosaic.tasks import board_shape, corner_fit
 from seamosaic.tasks import calibration_board as board
+from seamosaic.tasks import calibration_board_start as start
 from seamosaic.tasks import calibration_targets as targets
 from seamosaic.tasks.calibration_sheets import angle_deg
 from seamosaic.tasks.camera import project
@@ -42,7 +44,7 @@ def first(data, true):
     pairs = [
         (data.corner_board[data.corner_image == k], data.corner_uv[data.corner_image == k]) for k in range(data.images)
     ]
-    return board.first_camera(pairs, (true.camera.width, true.camera.height), "brown", FREE)
+    return start.first_camera(pairs, (true.camera.width, true.camera.height), "brown", FREE)
 
 
 def test_camera_and_sheets_within_their_sigmas():
@@ -71,6 +73,81 @@ def test_left_out_images_tell_a_wrong_light():
         np.nanmean(found.left_out_m[4]) if np.isfinite(found.left_out_m[4]).any() else np.inf for found in (good, bad)
     )
     assert after > 3 * before
+
+
+def bent_scene(true, bow_m, count=9):
+    """As `seen`, on a board bowed like a shallow trough; the light from exact rays onto the bowed board."""
+    data, (R, t) = seen(true, count, corner_px=0.03), board_poses(count)
+    shape = board_shape.Shape(np.zeros(2), 0.3, np.array([bow_m, 0, 0, 0, 0, 0.5 * bow_m, 0]))
+    on_board = data.corner_board + np.outer(board_shape.heights(shape, data.corner_board[:, :2]), [0, 0, 1])
+    X = np.einsum("pij,pj->pi", R[data.corner_image], on_board) + t[data.corner_image]
+    rng, parts = np.random.default_rng(3), []
+    for k in range(count):
+        for s, sheet in enumerate(true.laser.sheets):
+            normal, along = R[k].T @ np.array(sheet.normal), np.linspace(-0.25, 0.25, 30)
+            offset = sheet.offset - np.array(sheet.normal) @ t[k]
+            line = np.column_stack([np.zeros(30), along, np.zeros(30)])
+            for _ in range(6):
+                line[:, 0] = (offset - normal[1] * along - normal[2] * line[:, 2]) / normal[0]
+                line[:, 2] = board_shape.heights(shape, line[:, :2])
+            uv = project(true.camera, line @ R[k].T + t[k])
+            ok = np.isfinite(uv).all(1) & ((uv > 0) & (uv < [1215, 911])).all(1) & (np.abs(line[:, 0]) < 0.5)
+            noise = np.column_stack([rng.normal(0, 0.2, ok.sum()), np.zeros(ok.sum())])
+            parts.append((uv[ok] + noise, np.full(ok.sum(), s), np.full(ok.sum(), k), np.full(ok.sum(), 0.2)))
+    corner = project(true.camera, X) + rng.normal(0, 0.03, (len(X), 2))
+    ok = np.isfinite(corner).all(1)
+    light = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return board.BoardData(corner[ok], data.corner_board[ok], data.corner_image[ok], *light, count), shape
+
+
+def test_the_shape_of_a_bent_board_is_found():
+    true = calibration()
+    data, shape = bent_scene(true, 0.006)
+    flat, bent = (board.calibrate_board(data, true.camera, (), bent=bent) for bent in (False, True))
+    rms = [np.sqrt(np.nanmean(found.left_out_m**2)) for found in (flat, bent)]
+    assert 1e-5 < rms[1] < 0.5 * rms[0]
+    assert bent.corner_sigma_px < 0.05 < flat.corner_sigma_px
+    xy = data.corner_board[:63, :2]
+    off = board_shape.heights(bent.shape, xy) - board_shape.heights(shape, xy)
+    plane = np.column_stack([xy, np.ones(len(xy))])
+    off = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
+    assert np.sqrt(np.mean(off**2)) < 0.0006
+    for s, sheet in enumerate(true.laser.sheets):
+        assert angle_deg(bent.sheets[s][:3], sheet.normal) < 0.15
+
+
+def test_a_flat_board_stays_flat():
+    true = calibration()
+    found = board.calibrate_board(seen(true), true.camera, (), bent=True)
+    low, high = -0.24, 0.24
+    xy = np.stack(np.meshgrid([low, 0, high], [low, 0, high]), -1).reshape(-1, 2)
+    assert np.abs(board_shape.heights(found.shape, xy)).max() < 0.002
+
+
+def test_rays_meet_a_bent_board():
+    shape = board_shape.Shape(np.array([0.1, 0.0]), 0.2, 0.001 * np.arange(1, 8))
+    rng = np.random.default_rng(0)
+    on_board = rng.uniform(-0.2, 0.2, (50, 2))
+    X = np.column_stack([on_board, board_shape.heights(shape, on_board)])
+    origin = np.array([0.05, 0.02, -1.5]) + np.zeros((50, 3))
+    assert board_shape.meet(shape, origin, X - origin) == pytest.approx(X, abs=1e-5)
+
+
+@pytest.mark.parametrize("light", [0.0, 1.5])
+def test_corners_are_fitted_under_uneven_light(light: float):
+    rng, (columns, rows) = np.random.default_rng(0), (5, 4)
+    y, x = np.mgrid[:200, :220].astype(float)
+    A = np.array([[0.97, 0.06], [-0.05, 1.02]])
+    where = np.array([20.3, 18.6])
+    square = 30.0
+    a, b = ((np.stack([x, y], -1) - where) @ np.linalg.inv(A).T / square).transpose(2, 0, 1)
+    edge = [np.tanh(6 * np.sin(np.pi * c)) for c in (a, b)]
+    image = (100 + 50 * edge[0] * edge[1]) * np.exp(-light * (220 - x) / 220) + rng.normal(0, 1, x.shape)
+    i, j = np.meshgrid(np.arange(1, 6), np.arange(1, 5))
+    true = where + square * np.column_stack([i.ravel(), j.ravel()]) @ A.T
+    grey = np.clip(image, 0, 255).astype(np.uint8)
+    found = corner_fit.refined(grey, true + rng.uniform(-1.2, 1.2, true.shape), (columns, rows))
+    assert 0.001 < np.sqrt(np.mean((found - true) ** 2)) < 0.06
 
 
 def test_camera_behind_a_port():

@@ -126,6 +126,31 @@ def test_another_cell_size_recomputes_the_maps_only(reef, tmp_path):
         assert abs(round(new.bounds.left / 0.05) * 0.05 - new.bounds.left) < 1e-6
 
 
+def test_what_the_calibration_leaves_open_is_in_every_sigma(reef, tmp_path):
+    mission, out = tmp_path / "mission", tmp_path / "out"
+    shutil.copytree(reef.mission, mission)
+    shutil.copytree(reef.out, out)
+    content = yaml.safe_load((mission / "calibration.yaml").read_text())
+    content["covariance"] = [
+        {"parameters": ["laser.planes.a.offset", "laser.planes.b.offset"], "matrix": [[4e-6, 4e-6]] * 2}
+    ]
+    (mission / "calibration.yaml").write_text(yaml.safe_dump(content))
+    result = run(str(mission), out, Parameters(), scheduler="sync")
+    assert sum(_computed(result).values()) == 0
+    common = result.quality.calibration.sigma_m
+    assert 0.002 < common < 0.02  # 2 mm at the sheet, along rays that meet it at a slant
+    assert reef.result.quality.calibration.sigma_m is None
+    before, after = (folder / "uncertainty.tif" for folder in (reef.result.path, result.path))
+    with rasterio.open(before) as old, rasterio.open(after) as new:
+        a, b = old.read(1, masked=True), new.read(1, masked=True)
+    assert (a.mask == b.mask).all()
+    assert b.compressed() == pytest.approx(np.hypot(a.compressed(), common), rel=1e-4)
+    sigmas = [np.asarray(laspy.read(path / "soundings.laz")["sigma"]) for path in (reef.result.path, result.path)]
+    added = np.sqrt(sigmas[1] ** 2 - sigmas[0] ** 2)
+    assert np.median(added) == pytest.approx(common, rel=0.05)
+    assert "Error of the calibration" in (result.path / "report.html").read_text()
+
+
 def test_small_tiles_many_of_them_empty_give_the_same_maps(reef, tmp_path):
     """The track runs across the map: no image touches the tiles in its corners."""
     shutil.copytree(reef.out, tmp_path / "out")
