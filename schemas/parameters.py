@@ -101,6 +101,17 @@ class AdjustParameters(Model):
     ] = 0.02
 
 
+class BathymetryParameters(Model):
+    """What the bathymetry is made from, besides the laser and tie points."""
+
+    dense: Annotated[
+        bool, Field(description="match the pixels of overlapping images too; without, the gaps are interpolated")
+    ] = True
+    pairs_per_image: Annotated[
+        int, Field(ge=1, le=20, description="pairs that are matched densely, of those that an image is best seen in")
+    ] = 3
+
+
 class GridParameters(Model):
     """Gridded bathymetry."""
 
@@ -144,6 +155,7 @@ class Parameters(Model):
     features: FeatureParameters = FeatureParameters()
     match: MatchParameters = MatchParameters()
     adjust: AdjustParameters = AdjustParameters()
+    bathymetry: BathymetryParameters = BathymetryParameters()
     grid: GridParameters = GridParameters()
     mosaic: MosaicParameters = MosaicParameters()
     mesh: MeshParameters = MeshParameters()
