@@ -122,6 +122,10 @@ class GridParameters(Model):
         Annotated[float, Field(ge=0, le=50)] | Literal["auto"],
         Field(description="cells farther than this from any sounding stay empty, metres; auto: max(1, range / 3)"),
     ] = "auto"
+    max_sigma_m: Annotated[
+        Annotated[float, Field(gt=0)] | Literal["auto"],
+        Field(description="interpolated cells less certain than this stay empty, metres, 1-sigma; auto: range / 75"),
+    ] = "auto"
     tile_cells: Annotated[int, Field(ge=64, le=8192)] = 512
 
 

@@ -236,5 +236,5 @@ def _lines(seen: Sight, x: Array, y: Array, x_slope: Array, y_slope: Array) -> t
         zero = np.zeros(len(x))
         return zero, x_slope, zero, y_slope
     at = [((values + 0.5) / _STEP + 0.5).astype(np.float32) for values in (x, y)]
-    away = look_up(seen.departure, *at).astype(float).T
+    away = look_up(seen.departure, at[0], at[1]).astype(float).T
     return away[0], x_slope + away[1], away[2], y_slope + away[3]

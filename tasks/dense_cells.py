@@ -68,18 +68,30 @@ def _borne_out(X: Array, metres_per_px: Array, known: Array) -> Mask:
     return (X[:, 2] > z.min(1) - margin) & (X[:, 2] < z.max(1) + margin)
 
 
-def differences_px(X_map: Array, metres_per_px: Array, laser_map: Array, within_m: float) -> Array:
-    """Differences (K,), in pixels of disparity, of points (N, 3) from the laser's nearest sounding, if it is near."""
+class Differences(NamedTuple):
+    """Points less the laser's soundings beside them: (K,) metres, and in pixels of disparity."""
+
+    metres: Array
+    px: Array
+
+
+def differences(X_map: Array, metres_per_px: Array, laser_map: Array, within_m: float) -> Differences:
+    """Differences in elevation of points (N, 3) from the laser's nearest sounding, where one is near."""
     if not len(laser_map) or not len(X_map):
-        return np.zeros(0)
+        return Differences(np.zeros(0), np.zeros(0))
     base = laser_map[0, :2]
     away, nearest = (np.asarray(v) for v in KDTree(laser_map[:, :2] - base).query(X_map[:, :2] - base))
     near = away < within_m
-    return (X_map[near, 2] - laser_map[nearest[near], 2]) / metres_per_px[near]
+    off = X_map[near, 2] - laser_map[nearest[near], 2]
+    return Differences(off, off / metres_per_px[near])
 
 
-def spread_px(differences: Array, otherwise: float) -> float:
-    """1-sigma of what matching errs by in pixels: two thirds of its differences from the laser are within it."""
-    if len(differences) < _LEAST_COMPARED:
+def share_of_each(off: Array, otherwise: float) -> float:
+    """1-sigma of either side of differences (K,): two thirds of them are within it, times the root of two.
+
+    The poses of the laser's image and those of the pair are held by the same tie points, so either has half of the
+    variance. Too few differences say nothing.
+    """
+    if len(off) < _LEAST_COMPARED:
         return otherwise
-    return float(np.quantile(np.abs(differences), _ONE_SIGMA))
+    return float(np.quantile(np.abs(off), _ONE_SIGMA) / np.sqrt(2))

@@ -1,7 +1,7 @@
 """Per pair of images: dense matching, reduced to map cells; and how well matching agrees with the laser."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -21,9 +21,10 @@ _WIDTH_PX = 1200  # of the images that are matched, at most; they are at least h
 _DEPTH_SHARE = 0.005  # of what is known of the depth is left out at either end
 _DEPTH_MARGIN = 0.08  # of the depth
 _IMAGES_KEPT = 4
-_WITHIN_CELLS = 1.0
+_WITHIN_CELLS = 0.5
 # where no laser tells: half a pixel of dense matching, which is on smaller images, and one of tie points
-_DENSE_PX, _TIE_PX = 0.5, 1.0
+_DENSE_PX, _TIE_PX, _UNKNOWN_M = 0.5, 1.0, 1.0
+_NO_DIFFERENCES = dense_cells.Differences(np.zeros(0), np.zeros(0))
 
 
 class DensePair(NamedTuple):
@@ -32,6 +33,9 @@ class DensePair(NamedTuple):
     i: Image
     j: Image
     match: str
+
+
+_Views = Callable[[Image], tuple[np.ndarray, np.ndarray]]
 
 
 def dense_batch(m: MapJob, batch: Sequence[DensePair]) -> list[Done]:
@@ -65,7 +69,7 @@ def _scale(m: MapJob) -> int:
     return scale
 
 
-def _make(m: MapJob, pair: DensePair, solution: Solution, view) -> Made:
+def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
     camera, poses, (i, j) = m.job.calibration.camera, solution.poses, (pair.i.row, pair.j.row)
     known = np.concatenate([_ties(m, pair, solution).X_local, *(sounded(m, k, solution) for k in (pair.i, pair.j))])
     nothing = Made({}, {"cells": 0})
@@ -79,7 +83,8 @@ def _make(m: MapJob, pair: DensePair, solution: Solution, view) -> Made:
     if made is None:
         return nothing
     sights = [dense.sight(camera, made, poses.R_local_camera[k], k == j) for k in (i, j)]
-    warped = [dense.warp(made, seen, *view(image), scale) for seen, image in zip(sights, (pair.i, pair.j), strict=True)]
+    pixels = [view(image) for image in (pair.i, pair.j)]
+    warped = [dense.warp(made, seen, *of, scale) for seen, of in zip(sights, pixels, strict=True)]
     relief = dense.points(made, dense.disparity(made, *warped), *sights)
     to_map = m.frame.map_from_local
     cells = dense_cells.reduce_to_cells(to_map(relief.X_local), relief.metres_per_px, to_map(known), m.cell_m)
@@ -112,28 +117,35 @@ def read_cells(m: MapJob, key: str) -> PairCells:
 
 
 def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]]]) -> Done:
-    """How far matching is from the laser, in pixels of disparity, over some pairs.
+    """How well matching agrees with the laser over some pairs.
+
+    The info has the 1-sigma of dense matching and tie points in pixels of disparity, dense_px and tie_px, and that of
+    the laser's elevations by its images' poses, laser_m (1 m where nothing tells; bend_m then is 0).
 
     pairs : each with the key of its dense matching, "" without, and the images that touch it.
     """
     solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
 
     def make() -> Made:
-        dense_px, tie_px = [np.zeros(0)], [np.zeros(0)]
+        dense_off, tie_off = [_NO_DIFFERENCES], [_NO_DIFFERENCES]
         for pair, key, around in pairs:
             to_map, within = m.frame.map_from_local, _WITHIN_CELLS * m.cell_m
             lit = to_map(np.concatenate([sounded(m, image, solution) for image in around]))
             ties = _ties(m, pair, solution)
-            tie_px.append(dense_cells.differences_px(to_map(ties.X_local), ties.metres_per_px, lit, within))
+            tie_off.append(dense_cells.differences(to_map(ties.X_local), ties.metres_per_px, lit, within))
             if key:
                 cells = read_cells(m, key)
                 sure = cells.borne_out
-                dense_px.append(dense_cells.differences_px(cells.X_map[sure], cells.metres_per_px[sure], lit, within))
+                dense_off.append(dense_cells.differences(cells.X_map[sure], cells.metres_per_px[sure], lit, within))
+        dense_m, dense_px = (np.concatenate(values) for values in zip(*dense_off, strict=True))
+        tie_m, tie_px = (np.concatenate(values) for values in zip(*tie_off, strict=True))
         found = {
-            "dense_px": dense_cells.spread_px(np.concatenate(dense_px), _DENSE_PX),
-            "tie_px": dense_cells.spread_px(np.concatenate(tie_px), _TIE_PX),
+            "dense_px": dense_cells.share_of_each(dense_px, _DENSE_PX),
+            "tie_px": dense_cells.share_of_each(tie_px, _TIE_PX),
+            "laser_m": dense_cells.share_of_each(dense_m if len(dense_m) else tie_m, _UNKNOWN_M),
         }
-        return Made({}, {name: round(value, 2) for name, value in found.items()})
+        found["bend_m"] = found["laser_m"] if found["laser_m"] < _UNKNOWN_M else 0.0
+        return Made({}, {name: round(value, 4) for name, value in found.items()})
 
     rows = sorted({image.row for pair, _, around in pairs for image in (pair.i, pair.j, *around)})
     inputs = [pose_digest(solution, rows)]

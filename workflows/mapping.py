@@ -19,6 +19,7 @@ from .solve import Solution
 _LIGHTING_IMAGES = 200
 _GROWTH_TILES = 6
 _RELIEF_SHARE = 0.3
+_WORST_SIGMA = 1 / 75  # of the range: what interpolation knows less of it does not know
 _PAIRS_A_BATCH = 8
 _AGREEMENT_PAIRS = 60
 
@@ -39,7 +40,8 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     cell = grids.bathymetry_cell_m(gsd) if p.grid.cell_m == "auto" else float(p.grid.cell_m)
     mosaic_cell = grids.mosaic_cell_m(gsd) if p.mosaic.cell_m == "auto" else float(p.mosaic.cell_m)
     reach = max(1.0, typical / 3) if p.grid.max_interpolation_m == "auto" else float(p.grid.max_interpolation_m)
-    m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach)
+    worst = typical * _WORST_SIGMA if p.grid.max_sigma_m == "auto" else float(p.grid.max_sigma_m)
+    m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst)
     outlines = _outlines(state, posed.solution, ranges)
     linked, agreed = _dense(state, m, posed, images, outlines, ranges)
     surface_tiles = _surface(state, m, linked, agreed, images, outlines)

@@ -17,11 +17,14 @@ from .solve import Solution
 CELLS, GROWTH, SURFACE = "cells", "growth", "surface"
 _VERSION = code_version(sys.modules[__name__])
 _LEAST_HALO = 6  # cells
+# Of the variance of matching: what is a cell's own, what a pair's poses do to all of its cells, and what neighbouring
+# pairs have in common, as they share images and the bend of the whole, so that it does not average down
+_OWN, _SHARED, _BEND = 0.25, 0.35, 0.4
 
 
 def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
     """Soundings, tie points and dense matching of a tile, gridded. agreed : by `dense.agreement`."""
-    solution = relative(solve.solution(load(m.job, solve.STEP, m.adjusted)))
+    solution = relative(solve.solution(load(m.job, solve.STEP, m.adjusted)), agreed.info["laser_m"])
     inputs = [f"{image.row}:{image.key}" for image in tile.images] + [pose_digest(solution, rows_of(tile)), agreed.key]
     inputs += [f"{pair.i}-{pair.j}:{pair.key}:{pair.dense}" for pair in tile.pairs]
 
@@ -34,16 +37,18 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
                 parts.append(_dense(m, pair, count, agreed.info["dense_px"]))
         soundings = Soundings._make(np.concatenate(column) for column in zip(_NOTHING, *parts, strict=True))
         cells = gridding.grid_soundings(tile.grid, soundings)
+        cells = cells._replace(sigma=np.hypot(cells.sigma, np.sqrt(_BEND) * agreed.info["bend_m"]))
         return Made(cells._asdict(), {"sounded": int((cells.density > 0).sum())})
 
     return once(m.job, CELLS, _VERSION, inputs, context(m, tile), make, compress=True)
 
 
-def relative(solution: Solution) -> Solution:
+def relative(solution: Solution, measured_m: float) -> Solution:
     """The solution with sigmas relative to the map itself, where tie points hold its images together.
 
     What all images share, the error of the datum, is no error of one cell against another: the sigma of the best
-    image stands for it and is taken off. Images that navigation alone places keep theirs.
+    image stands for it and is taken off. What is left is made smaller where laser and matching agree better than it
+    says, to measured_m, 1-sigma of the elevation. Images that navigation alone places keep theirs.
     """
     held = np.array([status == "adjusted" for status in solution.status], bool) & solution.poses.known
     if not solution.bundled or not held.any():
@@ -52,6 +57,8 @@ def relative(solution: Solution) -> Solution:
     for values in (sigma_m, tilt):
         own = values[held]
         values[held] = np.sqrt(np.maximum(own**2 - own.min(0) ** 2, 0))
+    calm = min(1.0, measured_m / max(float(np.median(sigma_m[held, 2])), 1e-6))
+    sigma_m[held], tilt[held] = calm * sigma_m[held], calm * tilt[held]
     return solution._replace(sigma_m=sigma_m, sigma_tilt_rad=tilt)
 
 
@@ -88,8 +95,8 @@ def _matched(m: MapJob, pair: Pair, solution: Solution, tie_px: float) -> Soundi
 def _dense(m: MapJob, pair: Pair, images: int, dense_px: float) -> Soundings:
     """One sounding a cell, numbered as one more frame for the pair: what it errs by is its poses', mostly."""
     cells = dense.read_cells(m, pair.dense)
-    sigma = dense_px * cells.metres_per_px
-    found = _soundings(cells.X_map, sigma / 2, MATCHING, images * (pair.i + 1) + pair.j, sigma)
+    sigma, number = dense_px * cells.metres_per_px, images * (pair.i + 1) + pair.j
+    found = _soundings(cells.X_map, np.sqrt(_OWN) * sigma, MATCHING, number, np.sqrt(_SHARED) * sigma)
     return found._replace(doubtful=~cells.borne_out)
 
 
@@ -116,6 +123,7 @@ def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]],
         halo = grids.pad(tile, surface.halo_cells(m.max_interpolation_m, tile.cell_m))
         cells = _cells(m.job, halo, neighbours)
         found = surface.delaunay_surface(halo, cells, m.max_interpolation_m, law)
+        found = surface.without_guesses(found, m.max_sigma_m)
         inner = grids.window(halo, tile)
         layers = {
             "elevation": found.elevation.astype(np.float32),
@@ -126,7 +134,7 @@ def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]],
         cut = {name: values[inner] for name, values in layers.items()}
         return Made(cut, {"cells": int(np.isfinite(cut["elevation"]).sum())})
 
-    parameters = [list(tile), m.max_interpolation_m, list(law)]
+    parameters = [list(tile), m.max_interpolation_m, m.max_sigma_m, list(law)]
     return once(m.job, SURFACE, _VERSION, inputs, parameters, make, compress=True)
 
 

@@ -46,13 +46,20 @@ class Tile(NamedTuple):
 
 
 class MapJob(NamedTuple):
-    """What the map tasks know besides the job: the frame, the adjusted poses, the bathymetry's cell and reach."""
+    """What the map tasks know besides the job.
+
+    Attributes
+    ----------
+    frame : local and map. adjusted : key of the poses. cell_m : of the bathymetry.
+    max_interpolation_m, max_sigma_m : how far from soundings, and how uncertain, interpolated cells may be.
+    """
 
     job: Job
     frame: MapFrame
     adjusted: str
     cell_m: float
     max_interpolation_m: float
+    max_sigma_m: float
 
 
 def context(m: MapJob, tile: Tile) -> list[Any]:
