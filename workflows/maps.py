@@ -44,14 +44,14 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
 
 
 def relative(solution: Solution, measured_m: float) -> Solution:
-    """The solution with sigmas relative to the map itself, where tie points hold its images together.
+    """The solution with sigmas relative to the map itself, where matches hold its images together.
 
     What all images share, the error of the datum, is no error of one cell against another: the sigma of the best
     image stands for it and is taken off. What is left is made smaller where laser and matching agree better than it
     says, to measured_m, 1-sigma of the elevation. Images that navigation alone places keep theirs.
     """
     held = np.array([status == "adjusted" for status in solution.status], bool) & solution.poses.known
-    if not solution.bundled or not held.any():
+    if not held.any():
         return solution
     sigma_m, tilt = solution.sigma_m.copy(), solution.sigma_tilt_rad.copy()
     for values in (sigma_m, tilt):

@@ -126,6 +126,22 @@ def test_another_cell_size_recomputes_the_maps_only(reef, tmp_path):
         assert abs(round(new.bounds.left / 0.05) * 0.05 - new.bounds.left) < 1e-6
 
 
+def test_dense_matching_can_be_left_out_and_measured_cells_become_interpolated(reef, tmp_path):
+    shutil.copytree(reef.out, tmp_path / "out")
+    parameters = Parameters.model_validate({"bathymetry": {"dense": False}})
+    result = run(str(reef.mission), tmp_path / "out", parameters, scheduler="sync")
+    assert _computed(result)["dense"] == 0
+    shares = [one.quality.bathymetry.by_source for one in (result, reef.result)]
+    assert shares[0].image_matching < 0.1
+    assert 0.3 < shares[1].image_matching < 0.9
+    errors = [evaluate(one.path, reef.mission)["bathymetry"]["median_abs_m"] for one in (result, reef.result)]
+    assert errors[1] < 0.8 * errors[0]
+    fewer = Parameters.model_validate({"bathymetry": {"pairs_per_image": 1}})
+    steps = {step.name: step for step in run(str(reef.mission), tmp_path / "out", fewer, scheduler="sync").steps}
+    assert steps["dense"].computed == 0
+    assert 0 < steps["dense"].reused < {step.name: step for step in reef.result.steps}["dense"].computed
+
+
 def test_small_tiles_many_of_them_empty_give_the_same_maps(reef, tmp_path):
     """The track runs across the map: no image touches the tiles in its corners."""
     shutil.copytree(reef.out, tmp_path / "out")
