@@ -123,13 +123,15 @@ def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]],
         halo = grids.pad(tile, surface.halo_cells(m.max_interpolation_m, tile.cell_m))
         cells = _cells(m.job, halo, neighbours)
         found = surface.delaunay_surface(halo, cells, m.max_interpolation_m, law)
-        found = surface.without_guesses(found, m.max_sigma_m)
+        mapped = surface.without_guesses(found, m.max_sigma_m)
         inner = grids.window(halo, tile)
         layers = {
-            "elevation": found.elevation.astype(np.float32),
-            "sigma": found.sigma.astype(np.float32),
+            "elevation": mapped.elevation.astype(np.float32),
+            "sigma": mapped.sigma.astype(np.float32),
             "density": cells.density.astype(np.uint32),
-            "source": found.source,
+            "source": mapped.source,
+            # guesses too: to lay pictures on, they are better than nothing
+            "ground": found.elevation.astype(np.float32),
         }
         cut = {name: values[inner] for name, values in layers.items()}
         return Made(cut, {"cells": int(np.isfinite(cut["elevation"]).sum())})

@@ -130,7 +130,7 @@ def _on_surface(
     around = ground_around(tile.grid, ground[0][0].cell_m, m.max_interpolation_m)
     elevation = np.full(around.shape, np.nan)
     for grid, done in ground:
-        paste(around, elevation, grid, load(m.job, SURFACE, done.key, ("elevation",)).arrays["elevation"])
+        paste(around, elevation, grid, load(m.job, SURFACE, done.key, ("ground",)).arrays["ground"])
     local = _affine(m.frame, tile.grid, elevation)
     lies = {
         image.row: nodes.lie(local, poses.R_local_camera[image.row], poses.C_local[image.row]) for image in tile.images
