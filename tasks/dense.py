@@ -96,13 +96,13 @@ def rectify(
     z = z / np.linalg.norm(z)
     R_local_rect = np.column_stack([x, np.cross(z, x), z])
     range_m, focal = float(np.sqrt(depths_m[0] * depths_m[1])), scale * camera.fx
-    boxes = []
-    for k, along in ((i, 0.0), (j, base_m / range_m)):
-        slopes = _rect_slopes(camera, R_local_rect.T @ poses.R_local_camera[k], range_m)
-        boxes.append((slopes.min(0) + (along, 0), slopes.max(0) + (along, 0)))
-    low = np.floor(np.maximum(boxes[0][0], boxes[1][0]) * focal).astype(int)
-    size = np.ceil(np.minimum(boxes[0][1], boxes[1][1]) * focal).astype(int) - low
+    slopes_i, slopes_j = (
+        _rect_slopes(camera, R_local_rect.T @ poses.R_local_camera[k], range_m) * focal for k in (i, j)
+    )
     shift, last = (focal * base_m / depth for depth in (depths_m[1], depths_m[0]))
+    # the deeper the ground, the more of it both see
+    low = np.floor(np.maximum(slopes_i.min(0), slopes_j.min(0) + (shift, 0))).astype(int)
+    size = np.ceil(np.minimum(slopes_i.max(0), slopes_j.max(0) + (last, 0))).astype(int) - low
     count = int(np.ceil((last - np.floor(shift) + 1) / _DISPARITY_STEP)) * _DISPARITY_STEP
     if (size < _LEAST_PX).any() or count > _MOST_DISPARITIES:
         return None
