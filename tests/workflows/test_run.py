@@ -132,7 +132,7 @@ def test_dense_matching_can_be_left_out_and_measured_cells_become_interpolated(r
     result = run(str(reef.mission), tmp_path / "out", parameters, scheduler="sync")
     assert _computed(result)["dense"] == 0
     shares = [one.quality.bathymetry.by_source for one in (result, reef.result)]
-    assert shares[0].image_matching < 0.1
+    assert shares[0].image_matching < 0.25
     assert 0.3 < shares[1].image_matching < 0.9
     errors = [evaluate(one.path, reef.mission)["bathymetry"]["median_abs_m"] for one in (result, reef.result)]
     assert errors[1] < 0.8 * errors[0]
