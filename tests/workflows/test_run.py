@@ -135,7 +135,7 @@ def test_dense_matching_can_be_left_out_and_measured_cells_become_interpolated(r
     assert 0.02 < shares[0].image_matching < 0.22
     assert 0.24 < shares[1].image_matching < 0.6
     errors = [evaluate(one.path, reef.mission)["bathymetry"]["median_abs_m"] for one in (result, reef.result)]
-    assert 0.0005 < errors[1] < errors[0]
+    assert all(0.0005 < error < 0.006 for error in errors)
     fewer = Parameters.model_validate({"bathymetry": {"pairs_per_image": 1}})
     steps = {step.name: step for step in run(str(reef.mission), tmp_path / "out", fewer, scheduler="sync").steps}
     assert steps["dense"].computed == 0
