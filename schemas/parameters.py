@@ -61,9 +61,9 @@ class FeatureParameters(Model):
     """SIFT features (paper III.E)."""
 
     max_features: Annotated[int, Field(ge=100, le=50_000)] = 4000
-    max_pixels: Annotated[
-        int, Field(ge=100_000, description="images with more pixels are scaled down to this")
-    ] = 700_000
+    max_pixels: Annotated[int, Field(ge=100_000, description="images with more pixels are scaled down to this")] = (
+        700_000
+    )
     contrast_threshold: Annotated[float, Field(gt=0, le=0.2)] = 0.004
 
 
@@ -101,6 +101,17 @@ class AdjustParameters(Model):
     ] = 0.02
 
 
+class BathymetryParameters(Model):
+    """What the bathymetry is made from, besides the laser and tie points."""
+
+    dense: Annotated[
+        bool, Field(description="match the pixels of overlapping images too; without, the gaps are interpolated")
+    ] = True
+    pairs_per_image: Annotated[
+        int, Field(ge=1, le=20, description="pairs that are matched densely, of those that an image is best seen in")
+    ] = 3
+
+
 class GridParameters(Model):
     """Gridded bathymetry."""
 
@@ -110,6 +121,10 @@ class GridParameters(Model):
     max_interpolation_m: Annotated[
         Annotated[float, Field(ge=0, le=50)] | Literal["auto"],
         Field(description="cells farther than this from any sounding stay empty, metres; auto: max(1, range / 3)"),
+    ] = "auto"
+    max_sigma_m: Annotated[
+        Annotated[float, Field(gt=0)] | Literal["auto"],
+        Field(description="interpolated cells less certain than this stay empty, metres, 1-sigma; auto: range / 75"),
     ] = "auto"
     tile_cells: Annotated[int, Field(ge=64, le=8192)] = 512
 
@@ -144,6 +159,7 @@ class Parameters(Model):
     features: FeatureParameters = FeatureParameters()
     match: MatchParameters = MatchParameters()
     adjust: AdjustParameters = AdjustParameters()
+    bathymetry: BathymetryParameters = BathymetryParameters()
     grid: GridParameters = GridParameters()
     mosaic: MosaicParameters = MosaicParameters()
     mesh: MeshParameters = MeshParameters()

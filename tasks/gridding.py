@@ -38,81 +38,88 @@ class Cells(NamedTuple):
     y: Array
 
 
-class _Soundings(NamedTuple):
-    """Soundings sorted by cell, then frame."""
+class Soundings(NamedTuple):
+    """Soundings of the seabed in map coordinates, by whatever means.
 
-    cell: Indices
-    frame: Indices
+    Attributes
+    ----------
+    X : (N, 3) m. sigma : (N,) 1-sigma of each one's elevation on its own, m; positive.
+    source : (N,) uint8, 1 laser, 2 image matching.
+    frame : (N,) number of the image, or pair of images, that each comes from.
+    pose_sigma : (N,) 1-sigma of the elevation that all of the frame have in common, m.
+    doubtful : (N,) bool, those that count only if another frame says the same.
+    """
+
     X: Array
     sigma: Array
-    pose_sigma: Array
     source: NDArray[np.uint8]
-
-    def take(self, index: Indices | NDArray[np.bool_]) -> "_Soundings":
-        return _Soundings(
-            self.cell[index],
-            self.frame[index],
-            self.X[index],
-            self.sigma[index],
-            self.pose_sigma[index],
-            self.source[index],
-        )
+    frame: Indices
+    pose_sigma: Array
+    doubtful: NDArray[np.bool_]
 
 
-def grid_soundings(
-    grid: Grid, X_map: Array, sigma_m: Array, source: NDArray[np.uint8], frame: NDArray[np.integer], pose_sigma_m: Array
-) -> Cells:
+class _Sorted(NamedTuple):
+    """Soundings sorted by cell, then frame, with the flat index of the cell of each."""
+
+    cell: Indices
+    soundings: Soundings
+
+    def take(self, index: Indices | NDArray[np.bool_]) -> "_Sorted":
+        return _Sorted(self.cell[index], Soundings._make(values[index] for values in self.soundings))
+
+
+def grid_soundings(grid: Grid, soundings: Soundings) -> Cells:
     """Grid soundings. A cell depends on nothing but the soundings within it, in whatever order and tile they come.
 
-    Where a cell has laser soundings only these count; image matching fills the others. Soundings more than four
-    robust sigmas from the cell's median are outliers. The rest are averaged with inverse variances in two steps:
-    within a frame, where the error of the frame's pose is common to all and does not average down, then over
-    frames, where it does. A scatter larger than the sigmas explain enlarges the result (Birge's ratio).
-
-    Parameters
-    ----------
-    grid : the cells wanted; soundings outside are passed over.
-    X_map : (N, 3) soundings in map coordinates, m.
-    sigma_m : (N,) 1-sigma of each sounding's elevation on its own, m; positive.
-    source : (N,) 1 laser, 2 image matching.
-    frame : (N,) number of the image that each sounding comes from.
-    pose_sigma_m : (N,) 1-sigma of the elevation that all soundings of the frame have in common, m.
+    Where a cell has laser soundings only these count; image matching fills the others, where doubtful soundings must
+    be confirmed by another frame. Soundings more than four robust sigmas from the cell's median are outliers. The rest
+    are averaged with inverse variances in two steps: within a frame, where the error of the frame's pose is common to
+    all and does not average down, then over frames, where it does. A scatter larger than the sigmas explain enlarges
+    the result (Birge's ratio). Soundings outside of the grid are passed over.
     """
-    soundings = _sorted(grid, X_map, sigma_m, source, frame, pose_sigma_m)
-    soundings = _laser_first(soundings)
-    soundings = soundings.take(~_outliers(soundings))
-    return _means(grid, soundings)
+    placed = _laser_first(_sorted(grid, soundings))
+    placed = placed.take(~_unconfirmed(placed, grid.cell_m))
+    return _means(grid, placed.take(~_outliers(placed)))
 
 
-def _sorted(
-    grid: Grid, X_map: Array, sigma: Array, source: NDArray[np.uint8], frame: NDArray[np.integer], pose_sigma: Array
-) -> _Soundings:
-    row, column = index_of(grid, X_map)
-    usable = inside(grid, row, column) & np.isfinite(X_map).all(1) & (sigma > 0)
-    row, column = row[usable], column[usable]
-    everything = _Soundings(
-        row * grid.width + column,
-        np.asarray(frame)[usable].astype(np.int64),
-        X_map[usable],
-        sigma[usable],
-        pose_sigma[usable],
-        np.asarray(source)[usable].astype(np.uint8),
-    )
+def _sorted(grid: Grid, soundings: Soundings) -> _Sorted:
+    row, column = index_of(grid, soundings.X)
+    usable = inside(grid, row, column) & np.isfinite(soundings.X).all(1) & (soundings.sigma > 0)
+    everything = _Sorted(row * grid.width + column, soundings).take(usable)
     # within a cell the order is that of the values, so sums have the same bits however the soundings came
-    X = everything.X
-    return everything.take(np.lexsort((X[:, 1], X[:, 0], X[:, 2], everything.frame, everything.cell)))
+    X = everything.soundings.X
+    return everything.take(np.lexsort((X[:, 1], X[:, 0], X[:, 2], everything.soundings.frame, everything.cell)))
 
 
-def _laser_first(soundings: _Soundings) -> _Soundings:
+def _laser_first(placed: _Sorted) -> _Sorted:
     """Without the matched soundings of cells that the laser has seen."""
-    group = _group(soundings.cell)
-    has_laser = np.bincount(group, weights=soundings.source == LASER, minlength=1) > 0
-    return soundings.take((soundings.source == LASER) | ~has_laser[group])
+    group, laser = group_index(placed.cell), placed.soundings.source == LASER
+    has_laser = np.bincount(group, weights=laser, minlength=1) > 0
+    return placed.take(laser | ~has_laser[group])
 
 
-def _group(keys: Indices) -> Indices:
-    """0, 0, 1, 2, 2, ... for sorted keys (N,)."""
-    return np.concatenate([[0], np.cumsum(keys[1:] != keys[:-1])]).astype(np.int64)[: len(keys)]
+def _unconfirmed(placed: _Sorted, cell_m: float) -> NDArray[np.bool_]:
+    """Doubtful soundings of which no other frame's in the cell, next above or below, is within four sigmas.
+
+    Positions within a cell differ, so half a cell is let pass.
+    """
+    soundings = placed.soundings
+    if not soundings.doubtful.any():
+        return np.zeros(len(placed.cell), bool)
+    order = np.lexsort((soundings.X[:, 2], placed.cell))
+    cell, frame, z = placed.cell[order], soundings.frame[order], soundings.X[order, 2]
+    variance = (soundings.sigma**2 + soundings.pose_sigma**2)[order]
+    margin = _OUTLIER_SIGMAS * np.sqrt(variance[1:] + variance[:-1]) + cell_m / 2
+    same = (np.diff(cell) == 0) & (np.diff(frame) != 0) & (np.diff(z) < margin)
+    confirmed = np.zeros(len(cell), bool)
+    confirmed[order] = np.append(same, False) | np.insert(same, 0, False)
+    return soundings.doubtful & ~confirmed
+
+
+def group_index(keys: Indices) -> Indices:
+    """0, 0, 1, 2, 2, ... for sorted keys (N,) or rows of keys (N, K)."""
+    new = keys[1:] != keys[:-1]
+    return np.concatenate([[0], np.cumsum(new if new.ndim == 1 else new.any(1))]).astype(np.int64)[: len(keys)]
 
 
 def group_median(group: Indices, values: Array) -> Array:
@@ -127,15 +134,16 @@ def _ranked(group: Indices, values: Array) -> tuple[Array, Indices, Indices]:
     return values[np.lexsort((values, group))], np.cumsum(count) - count, count
 
 
-def _outliers(soundings: _Soundings) -> NDArray[np.bool_]:
+def _outliers(placed: _Sorted) -> NDArray[np.bool_]:
     """Farther than four sigmas from the cell's median; sigma is the spread of the nearer two thirds.
 
     So up to a third can be outliers; two images of about equal weight that contradict each other both stay, and
     enlarge the cell's sigma. A sounding's own sigma is the least spread that counts.
     """
-    if not len(soundings.cell):
+    if not len(placed.cell):
         return np.zeros(0, bool)
-    group, z = _group(soundings.cell), soundings.X[:, 2]
+    soundings, group = placed.soundings, group_index(placed.cell)
+    z = soundings.X[:, 2]
     departure = np.abs(z - group_median(group, z)[group])
     ranked, start, count = _ranked(group, departure)
     spread = ranked[start + (2 * count + 2) // 3 - 1] / _TWO_THIRDS_OF_SIGMA
@@ -144,22 +152,22 @@ def _outliers(soundings: _Soundings) -> NDArray[np.bool_]:
     return (departure > _OUTLIER_SIGMAS * np.maximum(spread[group], expected)) & (count[group] > 2)
 
 
-def _means(grid: Grid, soundings: _Soundings) -> Cells:
+def _means(grid: Grid, placed: _Sorted) -> Cells:
     count = grid.width * grid.height
-    density = np.bincount(soundings.cell, minlength=count).astype(np.int32)
+    density = np.bincount(placed.cell, minlength=count).astype(np.int32)
     source = np.zeros(count, np.uint8)
-    source[soundings.cell] = soundings.source
+    source[placed.cell] = placed.soundings.source
     position, sigma = np.full((count, 3), np.nan), np.full(count, np.nan)
-    if len(soundings.cell):
+    if len(placed.cell):
         cells = np.flatnonzero(density)
-        position[cells], sigma[cells] = _two_step_mean(soundings)
+        position[cells], sigma[cells] = _two_step_mean(placed)
     x, y, z = (column.reshape(grid.shape) for column in position.T)
     return Cells(z, sigma.reshape(grid.shape), density.reshape(grid.shape), source.reshape(grid.shape), x, y)
 
 
-def _two_step_mean(soundings: _Soundings) -> tuple[Array, Array]:
+def _two_step_mean(placed: _Sorted) -> tuple[Array, Array]:
     """Mean positions (G, 3) of the G cells and sigma (G,) of their elevations."""
-    of_cell = _group(soundings.cell)
+    soundings, of_cell = placed.soundings, group_index(placed.cell)
     changes = (np.diff(of_cell) > 0) | (np.diff(soundings.frame) != 0)
     of_frame = np.concatenate([[0], np.cumsum(changes)])
     first = np.concatenate([[0], np.flatnonzero(changes) + 1])

@@ -12,6 +12,10 @@ from .navigation import Poses
 
 Array = NDArray[Any]
 
+# base over height: a shorter one says little of depth, and on a longer one steep ground looks too different
+_SHORTEST_BASE, _GOOD_BASE, _LONGEST_BASE = 0.05, 0.25, 0.7
+_LEAST_OVERLAP = 0.15
+
 
 class Pairs(NamedTuple):
     """Pairs of images, i < j.
@@ -53,6 +57,20 @@ def overlapping(outlines: Array, margin_m: Array, min_overlap: float, max_per_im
     pairs = np.column_stack([known[left], known[right]])
     enough = overlap >= min_overlap
     return _largest_of_each(pairs[enough], overlap[enough], max_per_image)
+
+
+def for_depth(outlines: Array, images: NDArray[np.intp], base_to_height: Array, max_per_image: int) -> Pairs:
+    """Of pairs (P, 2), those that tell most of the depth: large overlaps on a base that is neither short nor long.
+
+    base_to_height : (P,) distance of the two cameras over their height. Of each image the `max_per_image` best are
+    kept; `overlap` of the result is what they were chosen by.
+    """
+    hulls = np.asarray(shapely.convex_hull(shapely.linestrings(outlines)))
+    one, other = (hulls[images[:, k]] for k in (0, 1))
+    overlap = shapely.area(shapely.intersection(one, other)) / np.minimum(shapely.area(one), shapely.area(other))
+    wide = np.clip(base_to_height / _GOOD_BASE, 0, 1)
+    good = (overlap > _LEAST_OVERLAP) & (base_to_height > _SHORTEST_BASE) & (base_to_height < _LONGEST_BASE)
+    return _largest_of_each(images[good], (overlap * wide)[good], max_per_image)
 
 
 def _largest_of_each(pairs: NDArray[np.intp], overlap: Array, count: int) -> Pairs:

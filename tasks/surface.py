@@ -200,6 +200,13 @@ def delaunay_surface(grid: Grid, cells: Cells, max_distance_m: float, growth: Gr
     return Surface(elevation, sigma, source)
 
 
+def without_guesses(surface: Surface, max_sigma_m: float) -> Surface:
+    """The surface without interpolated cells whose sigma is larger: a guess is no map."""
+    guess = (surface.source == INTERPOLATED) & (surface.sigma > max_sigma_m)
+    elevation, sigma = (np.where(guess, np.nan, layer) for layer in (surface.elevation, surface.sigma))
+    return Surface(elevation, sigma, np.where(guess, 0, surface.source).astype(np.uint8))
+
+
 def growth_sigma(growth: Growth, distance_m: Array, spread_m: Array) -> Array:
     """Sigma (N,) of interpolation, m, at a distance from the nearest sounding and with a spread of the corners."""
     return np.hypot(growth.scale_m * distance_m**growth.exponent, growth.relief * spread_m)

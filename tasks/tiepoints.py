@@ -27,20 +27,22 @@ class TiePoints(NamedTuple):
     ----------
     X_local : (N, 3) metres.
     sigma_m : (N,) 1-sigma of the elevation from the matches' own noise.
-    common_sigma_m : (N,) 1-sigma that the points of the pair share, from the error of the pair's motion.
+    common_sigma_m : (N,) 1-sigma that the points of the pair share, from the error of its poses.
+    metres_per_px : (N,) by which a pixel's error along the baseline moves a point.
     """
 
     X_local: Array
     sigma_m: Array
     common_sigma_m: Array
+    metres_per_px: Array
 
 
 def triangulate(
-    camera: Camera, uv_i: Array, uv_j: Array, poses: Poses, i: int, j: int, motion_covariance: Array
+    camera: Camera, uv_i: Array, uv_j: Array, poses: Poses, i: int, j: int, pose_sigma_px: float
 ) -> TiePoints:
     """Points midway where the rays of matches (M, 2) in pixels pass each other; rays that miss are left out.
 
-    motion_covariance : (6, 6) of the pair's motion, see `motion.Motion`.
+    pose_sigma_px : what the two poses may be wrong by, as an error of pixels along the baseline.
     """
     (o_i, d_i), (o_j, d_j) = (_local_rays(camera, uv, poses, k) for uv, k in ((uv_i, i), (uv_j, j)))
     between, cosine = o_j - o_i, np.einsum("nk,nk->n", d_i, d_j)
@@ -53,12 +55,12 @@ def triangulate(
     parallax = np.sqrt(sine_squared)
     keep = (range_i > 0) & (range_j > 0) & (gap_px < _MAX_GAP_PX) & (parallax > _MIN_PARALLAX)
     distance, parallax = range_i[keep], parallax[keep]
-    angle_sigma = _MATCH_SIGMA_PX * np.sqrt(2) / camera.fx
-    turn, shift = (np.sqrt(np.trace(motion_covariance[s, s]) / 3) for s in (slice(0, 3), slice(3, 6)))
+    metres_per_px = distance / parallax / camera.fx
     found = TiePoints(
         X_local=(P_i[keep] + P_j[keep]) / 2,
-        sigma_m=distance * angle_sigma / parallax,
-        common_sigma_m=np.hypot(distance * turn, shift) / parallax,
+        sigma_m=_MATCH_SIGMA_PX * np.sqrt(2) * metres_per_px,
+        common_sigma_m=pose_sigma_px * metres_per_px,
+        metres_per_px=metres_per_px,
     )
     certain = np.hypot(found.sigma_m, found.common_sigma_m) < _WORST_SIGMA * distance
     found = TiePoints(*(values[certain] for values in found))

@@ -8,9 +8,10 @@ from dask.delayed import delayed
 from ..tasks import camera as cameras
 from ..tasks import grids, pairs
 from ..tasks.grids import Grid
-from . import maps, mosaics
+from . import dense, maps, mosaics
 from .job import Done
-from .maps import Image, MapJob, Pair, Tile
+from .maps_inputs import Image, MapJob, Pair, Tile
+from .plan import batches
 from .results import Mapped, Posed, Tiles
 from .session import Session, compute
 from .solve import Solution
@@ -18,6 +19,9 @@ from .solve import Solution
 _LIGHTING_IMAGES = 200
 _GROWTH_TILES = 6
 _RELIEF_SHARE = 0.3
+_WORST_SIGMA = 1 / 75  # of the range: what interpolation knows less of it does not know
+_PAIRS_A_BATCH = 8
+_AGREEMENT_PAIRS = 60
 
 
 class NothingToMap(RuntimeError):
@@ -36,9 +40,11 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     cell = grids.bathymetry_cell_m(gsd) if p.grid.cell_m == "auto" else float(p.grid.cell_m)
     mosaic_cell = grids.mosaic_cell_m(gsd) if p.mosaic.cell_m == "auto" else float(p.mosaic.cell_m)
     reach = max(1.0, typical / 3) if p.grid.max_interpolation_m == "auto" else float(p.grid.max_interpolation_m)
-    m = MapJob(job, state.plan.frame, posed.adjusted.key, reach)
+    worst = typical * _WORST_SIGMA if p.grid.max_sigma_m == "auto" else float(p.grid.max_sigma_m)
+    m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst)
     outlines = _outlines(state, posed.solution, ranges)
-    surface_tiles = _surface(state, m, posed, images, outlines, cell)
+    linked, agreed = _dense(state, m, posed, images, outlines, ranges)
+    surface_tiles = _surface(state, m, linked, agreed, images, outlines)
     textured = [image for image in images if image.texture]
     light = _lighting(state, m, textured)
     mosaic = _mosaics(state, m, textured or images, outlines, surface_tiles, mosaic_cell, light, posed)
@@ -107,23 +113,79 @@ def _of_images(linked: Sequence[Pair], images: Sequence[Image]) -> tuple[Pair, .
     return tuple(pair for pair in linked if pair.i in rows or pair.j in rows)
 
 
+def _dense(
+    state: Session, m: MapJob, posed: Posed, images: Sequence[Image], outlines: np.ndarray, ranges: np.ndarray
+) -> tuple[list[Pair], Done]:
+    """The linked pairs, some of them with their dense matching, and how well matching agrees with the laser."""
+    for step in (dense.STEP, dense.AGREEMENT):
+        state.ledger.begin(step)
+    linked, by_row = _linked(posed), {image.row: image for image in images}
+    linked = [pair for pair in linked if pair.i in by_row and pair.j in by_row]
+    wanted = _wanted(state, posed, linked, outlines, ranges)
+    described = [dense.DensePair(by_row[pair.i], by_row[pair.j], pair.key) for pair in wanted]
+    tasks = [
+        delayed(dense.dense_batch)(m, batch, dask_key_name=f"dense-{k}")
+        for k, batch in enumerate(batches(described, _PAIRS_A_BATCH))
+    ]
+    made: list[Done] = [done for part in compute(state, dense.STEP, tasks) for done in part]
+    keys = {(pair.i.row, pair.j.row): done.key for pair, done in zip(described, made, strict=True)}
+    every = max(1, -(-len(linked) // _AGREEMENT_PAIRS))
+    sampled = [
+        (
+            dense.DensePair(by_row[pair.i], by_row[pair.j], pair.key),
+            keys.get((pair.i, pair.j), ""),
+            _beside(posed, by_row, pair),
+        )
+        for pair in (wanted or linked)[::every]
+    ]
+    (agreed,) = compute(state, dense.AGREEMENT, [delayed(dense.agreement)(m, sampled, dask_key_name="agreement")])
+    state.ledger.end(dense.STEP, made)
+    state.ledger.end(dense.AGREEMENT, [agreed])
+    return [pair._replace(dense=keys.get((pair.i, pair.j), "")) for pair in linked], agreed
+
+
+def _wanted(
+    state: Session, posed: Posed, linked: Sequence[Pair], outlines: np.ndarray, ranges: np.ndarray
+) -> list[Pair]:
+    """The pairs to match densely."""
+    p = state.job.parameters.bathymetry
+    if not p.dense or not linked:
+        return []
+    images, C = np.array([[pair.i, pair.j] for pair in linked]), posed.solution.poses.C_local
+    base = np.linalg.norm(C[images[:, 1]] - C[images[:, 0]], axis=1)
+    best = pairs.for_depth(outlines, images, base / ranges[images].mean(1), p.pairs_per_image)
+    chosen = set(map(tuple, best.images.tolist()))
+    return [pair for pair in linked if (pair.i, pair.j) in chosen]
+
+
+def _beside(posed: Posed, by_row: dict[int, Image], pair: Pair) -> tuple[Image, ...]:
+    """The images that are linked to both of a pair, and the pair's own."""
+    partners: dict[int, set[int]] = {pair.i: {pair.i, pair.j}, pair.j: {pair.i, pair.j}}
+    for i, j in posed.solution.pairs.tolist():
+        for one, other in ((i, j), (j, i)):
+            if one in partners:
+                partners[one].add(other)
+    rows = partners[pair.i] & partners[pair.j]
+    return tuple(by_row[row] for row in sorted(rows) if row in by_row)
+
+
 def _surface(
-    state: Session, m: MapJob, posed: Posed, images: Sequence[Image], outlines: np.ndarray, cell: float
+    state: Session, m: MapJob, linked: Sequence[Pair], agreed: Done, images: Sequence[Image], outlines: np.ndarray
 ) -> Tiles:
     """Bathymetry: cells of each tile, the law of interpolation, then the surface of each tile."""
     size = state.job.parameters.grid.tile_cells
     margin = _margin(outlines, images)
     bounds = _bounds(outlines, images)
-    grid = grids.pad(grids.grid_around(bounds, cell), 2)
+    grid = grids.pad(grids.grid_around(bounds, m.cell_m), 2)
     steps = (maps.CELLS, maps.GROWTH, maps.SURFACE)
     for step in steps:
         state.ledger.begin(step)
     tiles = list(grids.tiles(grid, size))
-    cell_tasks, linked = [], _linked(posed)
+    cell_tasks = []
     for k, tile in enumerate(tiles):
         touching = _touching(outlines, images, tile, margin)
         described = Tile(tile, touching, _of_images(linked, touching))
-        cell_tasks.append(delayed(maps.cells_tile)(m, described, dask_key_name=f"cells-{k}"))
+        cell_tasks.append(delayed(maps.cells_tile)(m, described, agreed, dask_key_name=f"cells-{k}"))
     cells: list[Done] = compute(state, maps.CELLS, cell_tasks)
     if not any(done.info["sounded"] for done in cells):
         raise NothingToMap(
@@ -133,7 +195,7 @@ def _surface(
     order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:_GROWTH_TILES]
     sampled = [(tiles[k], cells[k]) for k in sorted(order)]
     (growth,) = compute(state, maps.GROWTH, [delayed(maps.fit_growth)(m, sampled, dask_key_name="growth")])
-    halo = maps.surface.halo_cells(m.max_interpolation_m, cell)
+    halo = maps.surface.halo_cells(m.max_interpolation_m, m.cell_m)
     surface_tasks = []
     for k, tile in enumerate(tiles):
         around = grids.pad(tile, halo)

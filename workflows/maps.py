@@ -2,132 +2,102 @@
 
 import sys
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..tasks import gridding, grids, surface, tiepoints
-from ..tasks.frames import MapFrame
-from ..tasks.gridding import LASER, MATCHING, Cells
+from ..tasks import gridding, grids, surface
+from ..tasks.gridding import LASER, MATCHING, Cells, Soundings
 from ..tasks.grids import Grid
 from ..tasks.surface import Growth
-from . import extract, match, solve
-from .job import Done, Job, Made, array_digest, code_version, load, once, stage
+from . import dense, extract, solve
+from .job import Done, Job, Made, code_version, load, once
+from .maps_inputs import Image, MapJob, Pair, Tile, context, pose_digest, rows_of
 from .solve import Solution
 
 CELLS, GROWTH, SURFACE = "cells", "growth", "surface"
 _VERSION = code_version(sys.modules[__name__])
 _LEAST_HALO = 6  # cells
+# Of the variance of matching: what is a cell's own, what a pair's poses do to all of its cells, and what neighbouring
+# pairs have in common, as they share images and the bend of the whole, so that it does not average down
+_OWN, _SHARED, _BEND = 0.25, 0.35, 0.4
 
 
-class Image(NamedTuple):
-    """An image as the maps need it.
-
-    Attributes
-    ----------
-    row : of the frames table and of trajectory.csv. path, sha256 : of the file. key : of its extraction.
-    texture : whether it shows the seabed and not only the laser. range_m : height above the seabed.
-    """
-
-    row: int
-    path: str
-    sha256: str
-    key: str
-    texture: bool
-    range_m: float
-
-
-class Pair(NamedTuple):
-    """Two linked images and the key of their match."""
-
-    i: int
-    j: int
-    key: str
-
-
-class Tile(NamedTuple):
-    """A tile and what touches it."""
-
-    grid: Grid
-    images: tuple[Image, ...]
-    pairs: tuple[Pair, ...] = ()
-
-
-class MapJob(NamedTuple):
-    """What the map tasks know besides the job: the frame, the adjusted poses, the interpolation's reach."""
-
-    job: Job
-    frame: MapFrame
-    adjusted: str
-    max_interpolation_m: float
-
-
-def cells_tile(m: MapJob, tile: Tile) -> Done:
-    """Soundings and tie points of a tile, gridded."""
-    solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
-    inputs = [f"{image.row}:{image.key}" for image in tile.images] + [pose_digest(solution, tile)]
-    inputs += [f"{pair.i}-{pair.j}:{pair.key}" for pair in tile.pairs]
+def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
+    """Soundings, tie points and dense matching of a tile, gridded. agreed : by `dense.agreement`."""
+    solution = relative(solve.solution(load(m.job, solve.STEP, m.adjusted)), agreed.info["laser_m"])
+    inputs = [f"{image.row}:{image.key}" for image in tile.images] + [pose_digest(solution, rows_of(tile)), agreed.key]
+    inputs += [f"{pair.i}-{pair.j}:{pair.key}:{pair.dense}" for pair in tile.pairs]
 
     def make() -> Made:
-        parts = [_NO_PART, *(_laser(m, image, solution) for image in tile.images)]
-        parts += [_matched(m, pair, solution) for pair in tile.pairs]
-        X, sigma, source, frame, pose_sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
-        X_map = m.frame.map_from_local(X)
-        cells = gridding.grid_soundings(tile.grid, X_map, sigma, source.astype(np.uint8), frame, pose_sigma)
+        count = len(solution.sigma_m)
+        parts = [_laser(m, image, solution) for image in tile.images]
+        for pair in tile.pairs:
+            parts.append(_matched(m, pair, solution, agreed.info["tie_px"]))
+            if pair.dense:
+                parts.append(_dense(m, pair, count, agreed.info["dense_px"]))
+        soundings = Soundings._make(np.concatenate(column) for column in zip(_NOTHING, *parts, strict=True))
+        cells = gridding.grid_soundings(tile.grid, soundings)
+        cells = cells._replace(sigma=np.hypot(cells.sigma, np.sqrt(_BEND) * agreed.info["bend_m"]))
         return Made(cells._asdict(), {"sounded": int((cells.density > 0).sum())})
 
     return once(m.job, CELLS, _VERSION, inputs, context(m, tile), make, compress=True)
 
 
-def context(m: MapJob, tile: Tile) -> list[Any]:
-    """Where a tile lies and what its images were taken with, as it enters its digest."""
-    place = [m.frame.crs, m.frame.latitude, m.frame.longitude]
-    return [list(tile.grid), place, *stage(m.job.calibration.camera)]
+def relative(solution: Solution, measured_m: float) -> Solution:
+    """The solution with sigmas relative to the map itself, where matches hold its images together.
+
+    What all images share, the error of the datum, is no error of one cell against another: the sigma of the best
+    image stands for it and is taken off. What is left is made smaller where laser and matching agree better than it
+    says, to measured_m, 1-sigma of the elevation. Images that navigation alone places keep theirs.
+    """
+    held = np.array([status == "adjusted" for status in solution.status], bool) & solution.poses.known
+    if not held.any():
+        return solution
+    sigma_m, tilt = solution.sigma_m.copy(), solution.sigma_tilt_rad.copy()
+    for values in (sigma_m, tilt):
+        own = values[held]
+        values[held] = np.sqrt(np.maximum(own**2 - own.min(0) ** 2, 0))
+    calm = min(1.0, measured_m / max(float(np.median(sigma_m[held, 2])), 1e-6))
+    sigma_m[held], tilt[held] = calm * sigma_m[held], calm * tilt[held]
+    return solution._replace(sigma_m=sigma_m, sigma_tilt_rad=tilt)
 
 
-def pose_digest(solution: Solution, tile: Tile) -> str:
-    """Digest of the poses of the images that touch a tile."""
-    rows = sorted({image.row for image in tile.images} | {k for pair in tile.pairs for k in (pair.i, pair.j)})
-    poses = solution.poses
-    values = poses.R_local_camera[rows], poses.C_local[rows], solution.sigma_m[rows], solution.sigma_tilt_rad[rows]
-    return array_digest(*(np.round(value, 9) for value in values))
+def _soundings(X_map: np.ndarray, sigma: np.ndarray, source: int, frame: int, shared: np.ndarray) -> Soundings:
+    count = len(X_map)
+    return Soundings(
+        X_map,
+        sigma,
+        np.full(count, source, np.uint8),
+        np.full(count, frame),
+        np.broadcast_to(shared, count),
+        np.zeros(count, bool),
+    )
 
 
-Part = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-_NO_PART: Part = (np.zeros((0, 3)), np.zeros(0), np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+_NOTHING = _soundings(np.zeros((0, 3)), np.zeros(0), MATCHING, 0, np.zeros(0))
 
 
-def _laser(m: MapJob, image: Image, solution: Solution) -> Part:
-    """Local points, sigma, source, frame and the sigma they share through their image's pose."""
+def _laser(m: MapJob, image: Image, solution: Solution) -> Soundings:
     arrays = load(m.job, extract.STEP, image.key, ("laser_X", "laser_sigma")).arrays
     X_camera = arrays.get("laser_X", np.zeros((0, 3)))
-    count, poses = len(X_camera), solution.poses
-    X = X_camera @ poses.R_local_camera[image.row].T + poses.C_local[image.row]
     lean = np.hypot(X_camera[:, 0], X_camera[:, 1]) * solution.sigma_tilt_rad[image.row]
     shared = np.hypot(solution.sigma_m[image.row, 2], lean)
-    sigma = arrays.get("laser_sigma", np.zeros(0))
-    return X, sigma, np.full(count, LASER), np.full(count, image.row), shared
+    X = m.frame.map_from_local(dense.sounded(m, image, solution))
+    return _soundings(X, arrays.get("laser_sigma", np.zeros(0)), LASER, image.row, shared)
 
 
-def _matched(m: MapJob, pair: Pair, solution: Solution) -> Part:
-    entry = load(m.job, match.STEP, pair.key)
-    covariance = entry.arrays["covariance"].copy()
-    if not entry.info["metric"]:  # stated for a baseline of unit length
-        baseline = float(np.linalg.norm(solution.poses.C_local[pair.j] - solution.poses.C_local[pair.i]))
-        covariance[3:] *= baseline
-        covariance[:, 3:] *= baseline
-    points = tiepoints.triangulate(
-        m.job.calibration.camera,
-        entry.arrays["uv_i"].astype(float),
-        entry.arrays["uv_j"].astype(float),
-        solution.poses,
-        pair.i,
-        pair.j,
-        covariance,
-    )
-    count = len(points.X_local)
-    shared = np.hypot(solution.sigma_m[pair.i, 2], points.common_sigma_m)
-    return points.X_local, points.sigma_m, np.full(count, MATCHING), np.full(count, pair.i), shared
+def _matched(m: MapJob, pair: Pair, solution: Solution, tie_px: float) -> Soundings:
+    points = dense.tie_points(m, pair, solution, tie_px)
+    X = m.frame.map_from_local(points.X_local)
+    return _soundings(X, points.sigma_m, MATCHING, pair.i, points.common_sigma_m)
+
+
+def _dense(m: MapJob, pair: Pair, images: int, dense_px: float) -> Soundings:
+    """One sounding a cell, numbered as one more frame for the pair: what it errs by is its poses', mostly."""
+    cells = dense.read_cells(m, pair.dense)
+    sigma, number = dense_px * cells.metres_per_px, images * (pair.i + 1) + pair.j
+    found = _soundings(cells.X_map, np.sqrt(_OWN) * sigma, MATCHING, number, np.sqrt(_SHARED) * sigma)
+    return found._replace(doubtful=~cells.borne_out)
 
 
 def fit_growth(m: MapJob, tiles: Sequence[tuple[Grid, Done]]) -> Done:
@@ -153,17 +123,20 @@ def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]],
         halo = grids.pad(tile, surface.halo_cells(m.max_interpolation_m, tile.cell_m))
         cells = _cells(m.job, halo, neighbours)
         found = surface.delaunay_surface(halo, cells, m.max_interpolation_m, law)
+        mapped = surface.without_guesses(found, m.max_sigma_m)
         inner = grids.window(halo, tile)
         layers = {
-            "elevation": found.elevation.astype(np.float32),
-            "sigma": found.sigma.astype(np.float32),
+            "elevation": mapped.elevation.astype(np.float32),
+            "sigma": mapped.sigma.astype(np.float32),
             "density": cells.density.astype(np.uint32),
-            "source": found.source,
+            "source": mapped.source,
+            # guesses too: to lay pictures on, they are better than nothing
+            "ground": found.elevation.astype(np.float32),
         }
         cut = {name: values[inner] for name, values in layers.items()}
         return Made(cut, {"cells": int(np.isfinite(cut["elevation"]).sum())})
 
-    parameters = [list(tile), m.max_interpolation_m, list(law)]
+    parameters = [list(tile), m.max_interpolation_m, m.max_sigma_m, list(law)]
     return once(m.job, SURFACE, _VERSION, inputs, parameters, make, compress=True)
 
 

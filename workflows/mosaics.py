@@ -15,7 +15,8 @@ from ..tasks.navigation import Poses
 from ..tasks.nodes import Lie, Shot
 from . import extract, match, solve
 from .job import Done, Job, Made, code_version, load, once, stage
-from .maps import SURFACE, Image, MapJob, Pair, Tile, context, ground_around, paste, pose_digest
+from .maps import SURFACE, ground_around, paste
+from .maps_inputs import Image, MapJob, Pair, Tile, context, pose_digest, rows_of
 from .solve import Solution
 
 LIGHTING, ALIGN, MOSAIC = "lighting", "planar-align", "mosaic"
@@ -46,7 +47,7 @@ def _small(job: Job, image: Image, poses: Poses) -> tuple[np.ndarray, np.ndarray
 
 
 def _inputs(tile: Tile, solution: Solution) -> list[str]:
-    return [*(f"{image.row}:{image.key}" for image in tile.images), pose_digest(solution, tile)]
+    return [*(f"{image.row}:{image.key}" for image in tile.images), pose_digest(solution, rows_of(tile))]
 
 
 def _context(m: MapJob, tile: Tile) -> list[Any]:
@@ -129,7 +130,7 @@ def _on_surface(
     around = ground_around(tile.grid, ground[0][0].cell_m, m.max_interpolation_m)
     elevation = np.full(around.shape, np.nan)
     for grid, done in ground:
-        paste(around, elevation, grid, load(m.job, SURFACE, done.key, ("elevation",)).arrays["elevation"])
+        paste(around, elevation, grid, load(m.job, SURFACE, done.key, ("ground",)).arrays["ground"])
     local = _affine(m.frame, tile.grid, elevation)
     lies = {
         image.row: nodes.lie(local, poses.R_local_camera[image.row], poses.C_local[image.row]) for image in tile.images

@@ -271,6 +271,7 @@ def _provenance(results: Results, made_from: str) -> Provenance:
     job, mapped = results.job, results.mapped
     resolved = job.parameters.model_dump(mode="json")
     resolved["grid"] |= {"cell_m": mapped.cell_m, "max_interpolation_m": mapped.map_job.max_interpolation_m}
+    resolved["grid"]["max_sigma_m"] = mapped.map_job.max_sigma_m
     resolved["mosaic"]["cell_m"] = mapped.mosaic_cell_m
     return Provenance(
         digest=made_from,

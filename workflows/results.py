@@ -11,7 +11,7 @@ from ..catalog.missions import OpenedMission
 from ..schemas.provenance import Step
 from ..tasks.grids import Grid
 from .job import Done, Job
-from .maps import MapJob
+from .maps_inputs import MapJob
 from .plan import Plan
 from .solve import Solution
 

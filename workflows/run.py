@@ -17,7 +17,7 @@ from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.products import Quality
 from ..schemas.provenance import Step
-from . import extract, mapping, maps, match, mosaics, plan, products, solve
+from . import dense, extract, mapping, maps, match, mosaics, plan, products, solve
 from .executor import open_executor
 from .job import Done, Job, load, log
 from .plan import Plan
@@ -84,6 +84,7 @@ _VERSIONS = {
     extract.STEP: extract.VERSION,
     match.STEP: match.VERSION,
     solve.STEP: solve.VERSION,
+    **dense.VERSIONS,
     **maps.VERSIONS,
     **mosaics.VERSIONS,
 }

@@ -14,16 +14,17 @@ def soundings(rng, count, z=lambda x, y: 0 * x - 12.0, noise=0.004, grid=GRID):
     return np.column_stack([x, y, z(x, y) + rng.normal(0, noise, count)])
 
 
-def gridded(X, sigma=0.004, source=1, frame=0, pose=0.0, grid=GRID):
+def gridded(X, sigma=0.004, source=1, frame=0, pose=0.0, grid=GRID, doubtful=False):
     n = len(X)
-    return gridding.grid_soundings(
-        grid,
+    soundings = gridding.Soundings(
         X,
         np.broadcast_to(np.asarray(sigma, float), n),
         np.broadcast_to(np.asarray(source, np.uint8), n),
         np.broadcast_to(np.asarray(frame), n),
         np.broadcast_to(np.asarray(pose, float), n),
+        np.broadcast_to(np.asarray(doubtful), n),
     )
+    return gridding.grid_soundings(grid, soundings)
 
 
 def test_recovers_a_plane_with_the_error_that_it_states():
@@ -120,3 +121,18 @@ def test_group_median_is_numpys(pairs):
     group = np.unique(group, return_inverse=True)[1]
     expected = [np.median(values[group == g]) for g in range(group.max() + 1)]
     np.testing.assert_allclose(gridding.group_median(group, values), expected)
+
+
+def test_doubtful_soundings_need_another_frame_that_says_the_same():
+    x, y = (values.ravel() for values in grids.cell_centres(GRID))
+    ground, wrong = (np.column_stack([x, y, np.full(len(x), z)]) for z in (-12.0, -12.4))
+    frames = np.repeat([1, 2], len(x))
+    alone = gridded(wrong, source=2, frame=1, doubtful=True)
+    assert alone.density.sum() == 0
+    confirmed = gridded(np.vstack([wrong, wrong]), source=2, frame=frames, doubtful=True)
+    assert (confirmed.density == 2).all()
+    # twice by one frame is once
+    assert gridded(np.vstack([wrong, wrong]), source=2, frame=1, doubtful=True).density.sum() == 0
+    contradicted = gridded(np.vstack([ground, wrong]), source=2, frame=frames, doubtful=frames == 2)
+    assert np.allclose(contradicted.elevation, -12.0)
+    assert (contradicted.density == 1).all()

@@ -53,3 +53,15 @@ def test_seen_by_the_other_image():
     pixels = np.array([[200.0, 20.0], [200.0, 280.0]])  # the northern part is what the next image sees
     np.testing.assert_array_equal(pairs.seen_by(LENS, pixels, poses, 0, 1, 3.0, 0.0), [True, False])
     assert pairs.seen_by(LENS, pixels, poses, 0, 1, 3.0, 2.0).all()
+
+
+def test_depth_is_told_by_large_overlaps_on_a_good_base():
+    step = 0.3  # base over height 0.1 to the next; footprints of 1.8 m
+    outlines = pairs.footprints(LENS, _line(12, step), np.full(12, 3.0))
+    every = pairs.sequential(12, 6).images
+    base_to_height = np.diff(every, axis=1)[:, 0] * step / 3
+    one = pairs.for_depth(outlines, every, base_to_height, 1).images
+    assert (np.diff(one, axis=1) == 2).sum() >= 8  # the next but one: longer bases see less, shorter ones tell less
+    assert len(pairs.for_depth(outlines, every, base_to_height, 3).images) > 1.5 * len(one)
+    assert len(pairs.for_depth(outlines, every, base_to_height / 10, 3).images) == 0
+    assert len(pairs.for_depth(outlines, every, base_to_height * 20, 3).images) == 0

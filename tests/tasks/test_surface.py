@@ -22,9 +22,9 @@ def lines(rng, z, grid=GRID, spacing=0.5, noise=0.0, tilt=0.35):
 
 def gridded(X, grid=GRID, sigma=0.002, source=1):
     n = len(X)
-    return gridding.grid_soundings(
-        grid, X, np.full(n, sigma), np.full(n, source, np.uint8), np.zeros(n, int), np.full(n, 0.001)
-    )
+    frame, pose, doubtful = np.zeros(n, int), np.full(n, 0.001), np.zeros(n, bool)
+    soundings = gridding.Soundings(X, np.full(n, sigma), np.full(n, source, np.uint8), frame, pose, doubtful)
+    return gridding.grid_soundings(grid, soundings)
 
 
 def test_a_slope_is_recovered_exactly_between_and_on_the_soundings():
@@ -157,3 +157,17 @@ def test_too_few_soundings_or_all_in_a_line_make_no_surface(count):
     result = surface.delaunay_surface(GRID, cells, 1.0, GROWTH)
     assert (np.isfinite(result.elevation) == (cells.density > 0)).all()
     assert not len(surface.hold_out(GRID, cells, 1.0).error_m)
+
+
+def test_what_is_no_more_than_a_guess_stays_empty():
+    cells = gridded(lines(np.random.default_rng(0), lambda x, y: -10 + 0 * x))
+    result = surface.delaunay_surface(GRID, cells, 0.5, GROWTH)
+    limit = float(np.nanmedian(result.sigma[result.source == 3]))
+    kept = surface.without_guesses(result, limit)
+    gone = np.isfinite(result.elevation) & np.isnan(kept.elevation)
+    assert 0.4 < gone.sum() / (result.source == 3).sum() < 0.6
+    assert (result.source[gone] == 3).all()
+    assert (kept.source[gone] == 0).all()
+    assert np.isnan(kept.sigma[gone]).all()
+    assert np.nanmax(kept.sigma[kept.source == 3]) <= limit
+    assert np.array_equal(kept.elevation[~gone], result.elevation[~gone], equal_nan=True)

@@ -151,6 +151,20 @@ def test_what_the_calibration_leaves_open_is_in_every_sigma(reef, tmp_path):
     assert "Error of the calibration" in (result.path / "report.html").read_text()
 
 
+def test_dense_matching_can_be_left_out_and_measured_cells_become_interpolated(reef, tmp_path):
+    shutil.copytree(reef.out, tmp_path / "out")
+    parameters = Parameters.model_validate({"bathymetry": {"dense": False}})
+    result = run(str(reef.mission), tmp_path / "out", parameters, scheduler="sync")
+    assert _computed(result)["dense"] == 0
+    shares = [one.quality.bathymetry.by_source for one in (result, reef.result)]
+    assert 0.02 < shares[0].image_matching < 0.22
+    assert 0.24 < shares[1].image_matching < 0.6
+    errors = [evaluate(one.path, reef.mission)["bathymetry"]["median_abs_m"] for one in (result, reef.result)]
+    assert all(0.0005 < error < 0.006 for error in errors)
+    fewer = Parameters.model_validate({"bathymetry": {"pairs_per_image": 1}})
+    assert _computed(run(str(reef.mission), tmp_path / "out", fewer, scheduler="sync"))["dense"] == 0
+
+
 def test_small_tiles_many_of_them_empty_give_the_same_maps(reef, tmp_path):
     """The track runs across the map: no image touches the tiles in its corners."""
     shutil.copytree(reef.out, tmp_path / "out")

@@ -1,0 +1,97 @@
+"""What a densely matched pair says of each map cell, and whether what is surely known around it bears that out."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from .gridding import group_index, group_median
+
+Array = NDArray[Any]
+Mask = NDArray[np.bool_]
+
+_LEAST_POINTS = 3  # of a cell
+_NEIGHBOURS = 8
+_STEEPEST = 1.0  # rise over run from the points known to a cell among them
+_NEAR_PX = 2.0
+_ONE_SIGMA = 0.6827
+_LEAST_COMPARED = 30
+
+
+class PairCells(NamedTuple):
+    """One point for each cell that a pair has matched.
+
+    Attributes
+    ----------
+    X_map : (M, 3) mean position and median elevation of the cell's points, m.
+    metres_per_px : (M,) 1-sigma of the elevation for a pixel of disparity, m.
+    borne_out : (M,) whether laser and tie points around it say the same, within what terrain may do between them.
+    """
+
+    X_map: Array
+    metres_per_px: Array
+    borne_out: Mask
+
+
+NO_CELLS = PairCells(np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool))
+
+
+def reduce_to_cells(X_map: Array, metres_per_px: Array, known_map: Array, cell_m: float) -> PairCells:
+    """Cells of the points (N, 3) of a pair, map coordinates; known_map : (K, 3) laser and tie points around."""
+    key = np.floor(X_map[:, :2] / cell_m).astype(np.int64)
+    order = np.lexsort((X_map[:, 2], key[:, 0], key[:, 1]))
+    group = group_index(key[order])
+    count = np.bincount(group)
+    enough = count >= _LEAST_POINTS
+    order, group = order[enough[group]], group_index(group[enough[group]])
+    if not len(order):
+        return NO_CELLS
+    X, count = X_map[order], np.bincount(group)
+    base = X[0]  # eastings of a million metres lose no digits
+    x, y, scale = (np.bincount(group, v) / count for v in (X[:, 0] - base[0], X[:, 1] - base[1], metres_per_px[order]))
+    cells = np.column_stack([x + base[0], y + base[1], group_median(group, X[:, 2])])
+    return PairCells(cells, scale, _borne_out(cells, scale, known_map))
+
+
+def _borne_out(X: Array, metres_per_px: Array, known: Array) -> Mask:
+    """Which points lie between the lowest and the highest of the points known around them, or nearly so.
+
+    Where a boulder hides the ground from one image, matching invents ground, decimetres off and smooth.
+    """
+    if len(known) < _NEIGHBOURS:
+        return np.zeros(len(X), bool)
+    base = known[0, :2]
+    away, nearest = (np.asarray(v) for v in KDTree(known[:, :2] - base).query(X[:, :2] - base, k=_NEIGHBOURS))
+    z = known[nearest, 2]
+    margin = _NEAR_PX * metres_per_px + _STEEPEST * away[:, 0]
+    return (X[:, 2] > z.min(1) - margin) & (X[:, 2] < z.max(1) + margin)
+
+
+class Differences(NamedTuple):
+    """Points less the laser's soundings beside them: (K,) metres, and in pixels of disparity."""
+
+    metres: Array
+    px: Array
+
+
+def differences(X_map: Array, metres_per_px: Array, laser_map: Array, within_m: float) -> Differences:
+    """Differences in elevation of points (N, 3) from the laser's nearest sounding, where one is near."""
+    if not len(laser_map) or not len(X_map):
+        return Differences(np.zeros(0), np.zeros(0))
+    base = laser_map[0, :2]
+    away, nearest = (np.asarray(v) for v in KDTree(laser_map[:, :2] - base).query(X_map[:, :2] - base))
+    near = away < within_m
+    off = X_map[near, 2] - laser_map[nearest[near], 2]
+    return Differences(off, off / metres_per_px[near])
+
+
+def share_of_each(off: Array, otherwise: float) -> float:
+    """1-sigma of either side of differences (K,): two thirds of them are within it, times the root of two.
+
+    The poses of the laser's image and those of the pair are held by the same tie points, so either has half of the
+    variance. Too few differences say nothing.
+    """
+    if len(off) < _LEAST_COMPARED:
+        return otherwise
+    return float(np.quantile(np.abs(off), _ONE_SIGMA) / np.sqrt(2))

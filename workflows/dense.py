@@ -1,0 +1,158 @@
+"""Per pair of images: dense matching, reduced to map cells; and how well matching agrees with the laser."""
+
+import sys
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ..tasks import dense, dense_cells, laser, tiepoints
+from ..tasks.dense_cells import PairCells
+from . import extract, match, solve
+from .job import Done, Made, code_version, load, once, stage
+from .maps_inputs import Image, MapJob, Pair, pose_digest
+from .solve import Solution
+
+STEP, AGREEMENT = "dense", "agreement"
+_VERSION = code_version(sys.modules[__name__])
+_WIDTH_PX = 1200  # of the images that are matched, at most; they are at least halved
+_DEPTH_SHARE = 0.005  # of what is known of the depth is left out at either end
+_DEPTH_MARGIN = 0.08  # of the depth
+_IMAGES_KEPT = 4
+_WITHIN_CELLS = 0.5
+# where no laser tells: half a pixel of dense matching, which is on smaller images, and one of tie points
+_DENSE_PX, _TIE_PX, _UNKNOWN_M = 0.5, 1.0, 1.0
+_NO_DIFFERENCES = dense_cells.Differences(np.zeros(0), np.zeros(0))
+
+
+class DensePair(NamedTuple):
+    """Two images to match densely and the key of their match."""
+
+    i: Image
+    j: Image
+    match: str
+
+
+_Views = Callable[[Image], tuple[np.ndarray, np.ndarray]]
+
+
+def dense_batch(m: MapJob, batch: Sequence[DensePair]) -> list[Done]:
+    """Match some pairs densely."""
+    cv2.setNumThreads(1)
+    solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
+    view = lru_cache(_IMAGES_KEPT)(lambda image: _view(m, image))
+
+    def one(pair: DensePair) -> Done:
+        inputs = [pair.i.key, pair.j.key, pair.match, pose_digest(solution, (pair.i.row, pair.j.row))]
+        parameters = [m.frame.crs, m.frame.latitude, m.frame.longitude, m.cell_m, *stage(m.job.calibration.camera)]
+        return once(m.job, STEP, _VERSION, inputs, parameters, lambda: _make(m, pair, solution, view), True)
+
+    return [one(pair) for pair in batch]
+
+
+def _view(m: MapJob, image: Image) -> tuple[np.ndarray, np.ndarray]:
+    """An image's grey levels, reduced, and which of its pixels the laser lights."""
+    scale = _scale(m)
+    bgr = extract.read_verified(m.job, image.path, image.sha256, scale)
+    entry = load(m.job, extract.STEP, image.key, ("line_uv",))
+    line = (entry.arrays.get("line_uv", np.zeros((0, 2))) + 0.5) / scale - 0.5
+    halfwidth = entry.info["halfwidth_px"] / scale + 1
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY)), laser.mask(bgr.shape[:2], line, halfwidth)
+
+
+def _scale(m: MapJob) -> int:
+    scale = 2
+    while m.job.calibration.camera.width > _WIDTH_PX * scale:
+        scale *= 2
+    return scale
+
+
+def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
+    camera, poses, (i, j) = m.job.calibration.camera, solution.poses, (pair.i.row, pair.j.row)
+    known = np.concatenate([_ties(m, pair, solution).X_local, *(sounded(m, k, solution) for k in (pair.i, pair.j))])
+    nothing = Made({}, {"cells": 0})
+    if not len(known):
+        return nothing
+    depth = (known - poses.C_local[i]) @ poses.R_local_camera[i][:, 2]
+    least, most = np.quantile(depth, (_DEPTH_SHARE, 1 - _DEPTH_SHARE))
+    margin = _DEPTH_MARGIN * float(np.median(depth))
+    scale = _scale(m)
+    made = dense.rectify(camera, poses, i, j, (max(least - margin, 0.2), most + margin), 1 / scale)
+    if made is None:
+        return nothing
+    sights = [dense.sight(camera, made, poses.R_local_camera[k], k == j) for k in (i, j)]
+    pixels = [view(image) for image in (pair.i, pair.j)]
+    warped = [dense.warp(made, seen, *of, scale) for seen, of in zip(sights, pixels, strict=True)]
+    relief = dense.points(made, dense.disparity(made, *warped), *sights)
+    to_map = m.frame.map_from_local
+    cells = dense_cells.reduce_to_cells(to_map(relief.X_local), relief.metres_per_px, to_map(known), m.cell_m)
+    return Made(cells._asdict(), {"cells": len(cells.X_map)})
+
+
+def sounded(m: MapJob, image: Image, solution: Solution) -> np.ndarray:
+    """The laser soundings (N, 3) of an image, local."""
+    X = load(m.job, extract.STEP, image.key, ("laser_X",)).arrays.get("laser_X", np.zeros((0, 3)))
+    return X @ solution.poses.R_local_camera[image.row].T + solution.poses.C_local[image.row]
+
+
+def _ties(m: MapJob, pair: DensePair, solution: Solution) -> tiepoints.TiePoints:
+    return tie_points(m, Pair(pair.i.row, pair.j.row, pair.match), solution, _TIE_PX)
+
+
+def tie_points(m: MapJob, pair: Pair, solution: Solution, pose_sigma_px: float) -> tiepoints.TiePoints:
+    """The tie points of a pair."""
+    arrays = load(m.job, match.STEP, pair.key, ("uv_i", "uv_j")).arrays
+    uv_i, uv_j = (arrays[name].astype(float) for name in ("uv_i", "uv_j"))
+    return tiepoints.triangulate(m.job.calibration.camera, uv_i, uv_j, solution.poses, pair.i, pair.j, pose_sigma_px)
+
+
+def read_cells(m: MapJob, key: str) -> PairCells:
+    """The cells of a densely matched pair."""
+    arrays = load(m.job, STEP, key).arrays
+    if not arrays:
+        return dense_cells.NO_CELLS
+    return PairCells(**{name: arrays[name] for name in PairCells._fields})
+
+
+def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]]]) -> Done:
+    """How well matching agrees with the laser over some pairs.
+
+    The info has the 1-sigma of dense matching and tie points in pixels of disparity, dense_px and tie_px, and that of
+    the laser's elevations by its images' poses, laser_m (1 m where nothing tells; bend_m then is 0).
+
+    pairs : each with the key of its dense matching, "" without, and the images that touch it.
+    """
+    solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
+
+    def make() -> Made:
+        dense_off, tie_off = [_NO_DIFFERENCES], [_NO_DIFFERENCES]
+        for pair, key, around in pairs:
+            to_map, within = m.frame.map_from_local, _WITHIN_CELLS * m.cell_m
+            lit = to_map(np.concatenate([sounded(m, image, solution) for image in around]))
+            ties = _ties(m, pair, solution)
+            tie_off.append(dense_cells.differences(to_map(ties.X_local), ties.metres_per_px, lit, within))
+            if key:
+                cells = read_cells(m, key)
+                sure = cells.borne_out
+                dense_off.append(dense_cells.differences(cells.X_map[sure], cells.metres_per_px[sure], lit, within))
+        dense_m, dense_px = (np.concatenate(values) for values in zip(*dense_off, strict=True))
+        tie_m, tie_px = (np.concatenate(values) for values in zip(*tie_off, strict=True))
+        found = {
+            "dense_px": dense_cells.share_of_each(dense_px, _DENSE_PX),
+            "tie_px": dense_cells.share_of_each(tie_px, _TIE_PX),
+            "laser_m": dense_cells.share_of_each(dense_m if len(dense_m) else tie_m, _UNKNOWN_M),
+        }
+        found["bend_m"] = found["laser_m"] if found["laser_m"] < _UNKNOWN_M else 0.0
+        return Made({}, {name: round(value, 4) for name, value in found.items()})
+
+    rows = sorted({image.row for pair, _, around in pairs for image in (pair.i, pair.j, *around)})
+    inputs = [pose_digest(solution, rows)]
+    for pair, key, around in pairs:
+        inputs += [pair.match, key, *(image.key for image in around)]
+    place = [m.frame.crs, m.frame.latitude, m.frame.longitude]
+    return once(m.job, AGREEMENT, _VERSION, inputs, [*place, m.cell_m, *stage(m.job.calibration.camera)], make)
+
+
+VERSIONS = dict.fromkeys((STEP, AGREEMENT), _VERSION)
