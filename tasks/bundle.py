@@ -29,6 +29,7 @@ _LEAST_PARALLAX = 0.015  # radians
 # before each round, what is farther off is a wrong match: pixels, but not less than sigmas
 _GATES_PX, _GATE_SIGMAS = (100.0, 10.0, 1.0, 0.5), 5.0
 _TOLERANCES = 1e-2, 1e-2, 1e-3, 3e-4  # of each round: what the next one changes anyhow need not be found to the end
+_ANYWHERE_M = 100.0  # a sigma beyond this is no knowledge
 _COVARIANCE_SIGMA_PX = 1.0  # of sights, for the covariances: what calibration leaves is shared by many
 _RANGE_GATE = 6.0  # sigmas
 # The errors of ranges beside each other are alike. Sights hold an image against that; one that has none, as laser
@@ -91,7 +92,9 @@ def adjust(
             return chained
         graph, values = _graph(found.poses, found.block, _COVARIANCE_SIGMA_PX, navigation, p)
         sigma_m, sigma_tilt = sigmas(graph, values, found.poses, navigation)
-    except RuntimeError:  # GTSAM: something that neither sights nor ranges hold, such as the scale without a laser
+    except (RuntimeError, IndexError):  # GTSAM: something that nothing holds, such as the scale without a laser
+        return chained
+    if not (sigma_m[found.poses.known] < _ANYWHERE_M).all():
         return chained
     return chained._replace(poses=found.poses, sigma_m=sigma_m, sigma_tilt_rad=sigma_tilt, bundled=True)
 

@@ -37,10 +37,9 @@ def match(
         return known
     place = _predicted(x_a, x_a[right[:, 0]], x_b[right[:, 1]], found)
     reach = _REACH_PX / focal_px
-    distance, candidate = KDTree(x_b).query(place, k=min(_CANDIDATES, len(x_b)), distance_upper_bound=reach)
-    near = np.isfinite(distance)
-    rows, columns = np.nonzero(near)
-    candidate = candidate[rows, columns]
+    distance, candidate = KDTree(x_b).query(place, k=_CANDIDATES, distance_upper_bound=reach)
+    rows, columns = np.nonzero(np.isfinite(distance))
+    candidate = np.asarray(candidate)[rows, columns]
     on_line = np.abs(sampson(x_a[rows], x_b[candidate], found.R_i_j, found.t_i_j)) * focal_px < _EPIPOLAR_PX
     rows, candidate = rows[on_line], candidate[on_line]
     root_a, root_b = unit_root(a.descriptors), unit_root(b.descriptors)

@@ -168,9 +168,10 @@ def _matches(job: Job, a: Entry, b: Entry, index: tuple[np.ndarray, ...]) -> Mat
 def _guided(job: Job, found: motion.Motion, known: np.ndarray, a: Entry, b: Entry, range_m: float) -> np.ndarray:
     """The matches (M, 2) that a motion leads to."""
     lens = job.calibration.camera
-    sides = [features.Features(entry.arrays["feature_uv"], entry.arrays["feature_descriptors"]) for entry in (a, b)]
-    slopes = [camera.normalised(lens, side.uv.astype(float), range_m) for side in sides]
-    return guided.match(*sides, *slopes, known, found, range_m / camera.ground_sample_distance(lens, range_m))
+    of_a, of_b = (features.Features(e.arrays["feature_uv"], e.arrays["feature_descriptors"]) for e in (a, b))
+    x_a, x_b = (camera.normalised(lens, side.uv.astype(float), range_m) for side in (of_a, of_b))
+    focal_px = range_m / camera.ground_sample_distance(lens, range_m)
+    return guided.match(of_a, of_b, x_a, x_b, known, found, focal_px)
 
 
 def _estimate(

@@ -71,3 +71,18 @@ def test_the_ratio_decides_how_many_matches_there_are():
     a, b = (features.detect(each, _none(each), P) for each in (_seabed(seed=1), _seabed(seed=2)))
     strict, lax = (len(features.match(a.descriptors, b.descriptors, ratio)) for ratio in (0.7, 0.95))
     assert 3 * strict < lax
+
+
+def test_features_lie_where_they_are_and_not_a_part_of_a_pixel_beside():
+    image = np.full((480, 640), 90, np.uint8)
+    rng = np.random.default_rng(3)
+    true = np.column_stack([rng.permutation(np.arange(40, 600, 35)), rng.integers(40, 440, 16)]) + 0.3125
+    for u, v in true:
+        cv2.circle(image, (round(u * 16), round(v * 16)), 6 * 16, 200, -1, cv2.LINE_AA, shift=4)
+    image = cv2.GaussianBlur(image, (0, 0), 1)
+    for pixels in (image.size, image.size // 3):
+        found = features.detect(image, _none(image), FeatureParameters(max_pixels=pixels)).uv
+        off = found[:, None] - true[None]
+        nearest = np.linalg.norm(off, axis=2).argmin(0)
+        middle = np.median(off[nearest, np.arange(len(true))], axis=0)
+        assert np.abs(middle).max() < 0.1
