@@ -148,6 +148,9 @@ class TrajectoryQuality(Model):
     rejected: Count
     navigation_minus_adjusted: NavigationDifference | None = None
     sigma_median_m: Annotated[Vector | None, Field(description="1-sigma along x, y, z, metres")] = None
+    reprojection_rms_px: Annotated[
+        float | None, Field(ge=0, description="of tie points from where images see them, pixels at full resolution")
+    ] = None
 
 
 class SourceShares(Model):

@@ -37,6 +37,7 @@ class TextureScene(Model):
     cell_m: Annotated[float, Field(ge=0.0005, le=0.1, description="size of a texel, metres")] = 0.003
     contrast: Annotated[float, Field(ge=0, le=1, description="standard deviation of the albedo over its mean")] = 0.16
     spots_per_m2: Annotated[float, Field(ge=0, le=2000, description="stones and shells")] = 120.0
+    period_m: Annotated[float, Field(ge=0, le=100, description="it repeats itself in x and y; 0: never")] = 0.0
 
 
 class CameraScene(Model):

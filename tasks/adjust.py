@@ -51,7 +51,7 @@ class Adjusted(NamedTuple):
     sigma_tilt_rad : (n,) 1-sigma of the angle by which the optical axis may lean, about either image axis.
     status : per image.
     used : (links,) bool, False for links that contradict navigation or each other.
-    bundled : whether tie points and laser ranges have been adjusted with them.
+    reprojection_px : rms distance of the tie points from where they are seen; None where none were adjusted.
     turned : (n,) bool, images whose pixels lie the other way round than navigation has them.
     """
 
@@ -61,7 +61,7 @@ class Adjusted(NamedTuple):
     status: list[Status]
     used: NDArray[np.bool_]
     turned: NDArray[np.bool_]
-    bundled: bool = False
+    reprojection_px: float | None = None
 
 
 def adjust(

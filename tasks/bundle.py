@@ -96,7 +96,8 @@ def adjust(
         return chained
     if not (sigma_m[found.poses.known] < _ANYWHERE_M).all():
         return chained
-    return chained._replace(poses=found.poses, sigma_m=sigma_m, sigma_tilt_rad=sigma_tilt, bundled=True)
+    rms_px = float(np.sqrt((found.residual_px**2).sum(1).mean()))
+    return chained._replace(poses=found.poses, sigma_m=sigma_m, sigma_tilt_rad=sigma_tilt, reprojection_px=rms_px)
 
 
 def refine(

@@ -32,7 +32,11 @@ def make_texture(scene: TextureScene, half_m: float, rng: np.random.Generator) -
     albedo = np.dstack([np.clip(tint * grey, 8, 247).astype(np.uint8) for tint in _SEDIMENT])
     for _ in range(rng.poisson(scene.spots_per_m2 * (2 * half_m) ** 2)):
         _add_spot(albedo, scene, rng)
-    return albedo
+    period = round(scene.period_m / scene.cell_m)
+    if not 0 < period < size:
+        return albedo
+    repeats = -(-size // period)
+    return np.tile(albedo[:period, :period], (repeats, repeats, 1))[:size, :size]
 
 
 def _add_spot(albedo: NDArray[np.uint8], scene: TextureScene, rng: np.random.Generator) -> None:

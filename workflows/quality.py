@@ -57,7 +57,7 @@ def figures(
         soundings=_sounding_quality(results, soundings),
         calibration=calibration,
         pairs=_pair_quality(results),
-        trajectory=_trajectory_quality(rows, navigation),
+        trajectory=_trajectory_quality(rows, navigation, results.posed.solution.reprojection_px),
         bathymetry=_bathymetry_quality(folder, results.mapped.cell_m),
         mosaic=_mosaic_quality(results),
         mesh=triangles,
@@ -81,7 +81,7 @@ def _doubts(rows: Sequence[trajectories.Row], results: Results) -> Iterator[str]
             f"{len(turned)} of {len(rows)} images lie the other way round than mount and heading say, by their matches "
             f"with others, and were placed so (turned by a picture viewer? flown backwards?): {names}"
         )
-    if len(results.posed.solution.pairs) and not results.posed.solution.bundled:
+    if len(results.posed.solution.pairs) and results.posed.solution.reprojection_px is None:
         yield (
             "poses are from the motions of pairs alone: tie points were too few, or with the laser's ranges left "
             "something open, such as the scale"
@@ -116,7 +116,9 @@ def _pair_quality(results: Results) -> PairQuality:
     )
 
 
-def _trajectory_quality(rows: Sequence[trajectories.Row], navigation: np.ndarray) -> TrajectoryQuality:
+def _trajectory_quality(
+    rows: Sequence[trajectories.Row], navigation: np.ndarray, reprojection_px: float | None
+) -> TrajectoryQuality:
     kinds = Counter(row.kind for row in rows)
     placed = [(k, row.pose) for k, row in enumerate(rows) if row.pose is not None]
     positions = np.array([pose.position for _, pose in placed]).reshape(-1, 3)
@@ -129,6 +131,7 @@ def _trajectory_quality(rows: Sequence[trajectories.Row], navigation: np.ndarray
         rejected=kinds["rejected"],
         navigation_minus_adjusted=_difference(difference) if len(difference) else None,
         sigma_median_m=tuple(np.median(sigmas, axis=0).tolist()) if len(sigmas) else None,
+        reprojection_rms_px=reprojection_px,
     )
 
 

@@ -143,6 +143,9 @@ def _image_figures(quality: Quality) -> Iterator[KeyFigure]:
             f"± {_length(max(x, y))} across, ± {_length(z)} in height",
             "median 1-sigma along an axis: two times out of three the camera really was within this",
         )
+    if trajectory.reprojection_rms_px is not None:
+        meaning = "rms distance between where tie points are seen and where the adjusted cameras should see them"
+        yield KeyFigure("Reprojection error", f"{trajectory.reprojection_rms_px:.2f} px", meaning)
     if trajectory.navigation_minus_adjusted is not None:
         yield _difference_figure(trajectory.navigation_minus_adjusted)
 

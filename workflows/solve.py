@@ -22,7 +22,7 @@ class Solution(NamedTuple):
 
     Attributes
     ----------
-    poses, sigma_m, sigma_tilt_rad, status, turned, bundled : see `tasks.adjust.Adjusted`.
+    poses, sigma_m, sigma_tilt_rad, status, turned, reprojection_px : see `tasks.adjust.Adjusted`.
     pairs : (P, 2) rows of the linked pairs that were used.
     """
 
@@ -32,7 +32,7 @@ class Solution(NamedTuple):
     status: list[str]
     pairs: np.ndarray
     turned: np.ndarray
-    bundled: bool
+    reprojection_px: float | None
 
 
 def adjust_all(
@@ -70,7 +70,7 @@ def adjust_all(
             "pairs": np.array([[i, j] for i, j, _ in used], int).reshape(-1, 2),
             "turned": found.turned,
         }
-        return Made(arrays, {"status": found.status, "bundled": found.bundled})
+        return Made(arrays, {"status": found.status, "reprojection_px": found.reprojection_px})
 
     return once(job, STEP, VERSION, [str(count), *inputs], parameters, make)
 
@@ -102,5 +102,11 @@ def solution(entry: Entry) -> Solution:
     poses = Poses(arrays["R"], arrays["C"])
     status, turned = entry.info["status"], arrays["turned"]
     return Solution(
-        poses, arrays["sigma_m"], arrays["sigma_tilt_rad"], status, arrays["pairs"], turned, entry.info["bundled"]
+        poses,
+        arrays["sigma_m"],
+        arrays["sigma_tilt_rad"],
+        status,
+        arrays["pairs"],
+        turned,
+        entry.info["reprojection_px"],
     )

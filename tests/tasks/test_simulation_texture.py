@@ -39,3 +39,12 @@ def test_large_pixels_average_texels():
     coarse = blurred(fine, 0.003, 0.02).astype(float)
     assert coarse.std() < 0.9 * fine.std()
     assert coarse.mean() == pytest.approx(fine.mean(), rel=0.01)
+
+
+def test_a_texture_with_a_period_repeats_itself():
+    scene = TextureScene(cell_m=0.01, period_m=0.8)
+    found = make_texture(scene, 1.5, np.random.default_rng(0))
+    assert found.shape == (300, 300, 3)
+    assert (found[:80] == found[80:160]).all()
+    assert (found[:, 30:100] == found[:, 190:260]).all()
+    assert (found[:40] != found[40:80]).mean() > 0.5

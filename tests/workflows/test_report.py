@@ -103,6 +103,7 @@ def full_quality():
             rejected=2,
             navigation_minus_adjusted=products.NavigationDifference(x=axis, y=axis, z=axis),
             sigma_median_m=(0.011, 0.012, 0.004),
+            reprojection_rms_px=0.43,
         ),
         bathymetry=products.BathymetryQuality(
             cell_m=0.05,
