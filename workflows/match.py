@@ -54,7 +54,8 @@ Carried = tuple[tuple[Entry, RelativePrior], ...]
 PairSoundings = tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]
 _HALF_TURNS = (True, True), (False, True), (True, False)
 _ALIKE_DEG = 20.0
-_STRONGEST = 1500  # features of an image that are asked whether navigation is wrong
+_ALIKE_COSINE = 0.7
+_STRONGEST = 2000  # features of images far apart in time that are asked whether either lies the other way round
 
 
 def match_batch(job: Job, batch: Sequence[PairTask], extracted: Mapping[int, Done]) -> list[tuple[int, int, Done]]:
@@ -118,7 +119,8 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
     soundings = _soundings(a, carried[0]), _soundings(b, carried[1])
     found, turned, free = _estimate(job, pair.prior, matched, soundings, at), (False, False), False
     if pair.prior is not None and _weak(found, matched):
-        every = _matches(job, a, b, (everything[0][:_STRONGEST], everything[1][:_STRONGEST]))
+        asked = None if pair.next else _STRONGEST
+        every = _matches(job, a, b, (everything[0][:asked], everything[1][:asked]))
         needed = 2 * max(len(found.inliers) if found else 0, job.parameters.match.min_inliers)
         if len(every.features) > 3 * needed:  # fewer are chance
             best, turned, free = _against_navigation(job, pair, every, needed, soundings, at)
@@ -214,9 +216,10 @@ def _against_navigation(
 
 
 def _alike(found: motion.Motion, prior: RelativePrior) -> bool:
-    """Whether a motion is roughly one that navigation believes: the same turn, and not into the opposite direction."""
+    """Whether a motion is roughly one that navigation believes: the same turn, and the same direction."""
     turn = angle_between_deg(found.R_i_j, prior.R_i_j)
-    return turn < _ALIKE_DEG and float(found.t_i_j @ prior.t_i_j) > 0
+    lengths = float(np.linalg.norm(found.t_i_j) * np.linalg.norm(prior.t_i_j))
+    return turn < _ALIKE_DEG and float(found.t_i_j @ prior.t_i_j) > _ALIKE_COSINE * lengths
 
 
 def _soundings(entry: Entry, carried: Carried) -> tuple[np.ndarray, float]:
