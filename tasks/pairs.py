@@ -65,8 +65,9 @@ def for_depth(outlines: Array, images: NDArray[np.intp], base_to_height: Array, 
     base_to_height : (P,) distance of the two cameras over their height. Of each image the `max_per_image` best are
     kept; `overlap` of the result is what they were chosen by.
     """
-    hulls = np.asarray(shapely.convex_hull(shapely.linestrings(outlines)))
-    one, other = (hulls[images[:, k]] for k in (0, 1))
+    rows, number = np.unique(images, return_inverse=True)  # others may have no pose
+    hulls = np.asarray(shapely.convex_hull(shapely.linestrings(outlines[rows])))
+    one, other = hulls[number.reshape(-1, 2)].T
     overlap = shapely.area(shapely.intersection(one, other)) / np.minimum(shapely.area(one), shapely.area(other))
     wide = np.clip(base_to_height / _GOOD_BASE, 0, 1)
     good = (overlap > _LEAST_OVERLAP) & (base_to_height > _SHORTEST_BASE) & (base_to_height < _LONGEST_BASE)

@@ -173,9 +173,12 @@ def test_small_tiles_many_of_them_empty_give_the_same_maps(reef, tmp_path):
     assert _computed(result)["cells"] > 6
     for name in ("bathymetry.tif", "source.tif", "mosaic-source.tif"):
         with rasterio.open(result.path / name) as small, rasterio.open(reef.result.path / name) as large:
-            a, b = small.read(1), large.read(1)
+            a, b = small.read(1, masked=True), large.read(1, masked=True)
         assert a.shape == b.shape
-        assert (a == b).mean() > 0.999, name
+        # which interpolated cells are too uncertain to show is decided by what sampled tiles have in common
+        assert (a.mask == b.mask).mean() > 0.998, name
+        both = ~a.mask & ~b.mask
+        assert (a.data == b.data)[both].mean() > 0.9999, name
 
 
 def test_an_image_without_a_time_is_a_row_of_its_own(spoilt, tmp_path):
