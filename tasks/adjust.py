@@ -205,12 +205,7 @@ def _agrees(link: Link, values: Any) -> bool:
 
 def sigmas(graph: Any, values: Any, poses: Poses, navigation: NavigationPrior | None) -> tuple[Array, Array]:
     """Sigmas (n, 3) of the camera centres along the local axes and (n,) of the lean of the optical axes."""
-    # by QR: that a map may move as a whole by decimetres, but its parts by tenths of millimetres, is too much for
-    # the Cholesky factors of gtsam.Marginals
-    p = gtsam.ISAM2Params()
-    p.setFactorization("QR")
-    marginals = gtsam.ISAM2(p)
-    marginals.update(graph, values)
+    marginals = _marginals(graph, values)
     count = len(poses.C_local)
     position, tilt = np.full((count, 3), np.nan), np.full(count, np.nan)
     for k in np.flatnonzero(poses.known).tolist():
@@ -220,6 +215,22 @@ def sigmas(graph: Any, values: Any, poses: Poses, navigation: NavigationPrior | 
     if navigation is not None:  # roll and pitch err by a bias too, which no number of images averages down
         tilt = np.hypot(tilt, navigation.sigma_attitude[:, :2].mean(1))
     return position, tilt
+
+
+def _marginals(graph: Any, values: Any) -> Any:
+    """What tells the covariance of each variable.
+
+    That a map may move as a whole by decimetres, but its parts by tenths of millimetres, can be too much for Cholesky
+    factors; QR bears it, for several times the memory.
+    """
+    try:
+        return gtsam.Marginals(graph, values)
+    except RuntimeError:
+        p = gtsam.ISAM2Params()
+        p.setFactorization("QR")
+        by_qr = gtsam.ISAM2(p)
+        by_qr.update(graph, values)
+        return by_qr
 
 
 def _status(links: list[Link], poses: Poses, navigation: NavigationPrior | None) -> list[Status]:
