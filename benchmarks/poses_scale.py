@@ -99,6 +99,7 @@ def navigation(poses: Poses, rng: np.random.Generator) -> NavigationPrior:
 
 
 def spread(off) -> float:
+    """Rms distance (M, 3) from the mean."""
     return float(np.sqrt(((off - off.mean(0)) ** 2).sum(1).mean()))
 
 
@@ -112,10 +113,7 @@ def run(count: int) -> None:
     middle = time.process_time()
     found = bundle.adjust(LENS, chained, seen, lit, prior, p)
     ended = time.process_time()
-    off = found.poses.C_local - true.C_local
-    rms = [
-        float(np.sqrt((d - d.mean(0)).__pow__(2).sum(1).mean())) for d in (chained.poses.C_local - true.C_local, off)
-    ]
+    rms = [spread(each.poses.C_local - true.C_local) for each in (chained, found)]
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(
         f"{count} images, {len(seen.image)} sights, {seen.tie_points} tie points, {len(linked)} links: pose graph "

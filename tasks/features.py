@@ -53,8 +53,6 @@ def detect(grey: NDArray[np.uint8], ignore: NDArray[np.bool_], parameters: Featu
 
 def _strongest_everywhere(uv: NDArray, response: NDArray, shape: tuple[int, ...], count: int) -> NDArray[np.intp]:
     """Indices of at most `count` features: by rank of their response within their cell of the image."""
-    if len(uv) <= count:
-        return np.arange(len(uv))
     column = np.minimum(uv[:, 0] * _CELLS_PER_SIDE / shape[1], _CELLS_PER_SIDE - 1).astype(int)
     row = np.minimum(uv[:, 1] * _CELLS_PER_SIDE / shape[0], _CELLS_PER_SIDE - 1).astype(int)
     cell = row * _CELLS_PER_SIDE + column

@@ -223,7 +223,7 @@ def _alike(found: motion.Motion, prior: RelativePrior) -> bool:
 
 
 def _soundings(entry: Entry, carried: Carried) -> tuple[np.ndarray, float]:
-    """PairSoundings (L, 3) in the frame of an image, and the sigma, metres, that they share.
+    """Soundings (L, 3) in the frame of an image, and the sigma, metres, that they share.
 
     An image without a laser has those of the laser images taken just before and after, carried over by navigation.
     """
