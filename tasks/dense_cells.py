@@ -27,17 +27,21 @@ class PairCells(NamedTuple):
     X_map : (M, 3) mean position and median elevation of the cell's points, m.
     metres_per_px : (M,) 1-sigma of the elevation for a pixel of disparity, m.
     borne_out : (M,) whether laser and tie points around it say the same, within what terrain may do between them.
+    noise_px : (M,) 1-sigma of the disparity by the noise of the images.
     """
 
     X_map: Array
     metres_per_px: Array
     borne_out: Mask
+    noise_px: Array
 
 
-NO_CELLS = PairCells(np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool))
+NO_CELLS = PairCells(np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool), np.zeros(0))
 
 
-def reduce_to_cells(X_map: Array, metres_per_px: Array, known_map: Array, cell_m: float) -> PairCells:
+def reduce_to_cells(
+    X_map: Array, metres_per_px: Array, noise_px: Array, known_map: Array, cell_m: float
+) -> PairCells:
     """Cells of the points (N, 3) of a pair, map coordinates; known_map : (K, 3) laser and tie points around."""
     key = np.floor(X_map[:, :2] / cell_m).astype(np.int64)
     order = np.lexsort((X_map[:, 2], key[:, 0], key[:, 1]))
@@ -49,9 +53,10 @@ def reduce_to_cells(X_map: Array, metres_per_px: Array, known_map: Array, cell_m
         return NO_CELLS
     X, count = X_map[order], np.bincount(group)
     base = X[0]  # eastings of a million metres lose no digits
-    x, y, scale = (np.bincount(group, v) / count for v in (X[:, 0] - base[0], X[:, 1] - base[1], metres_per_px[order]))
+    means = (X[:, 0] - base[0], X[:, 1] - base[1], metres_per_px[order], noise_px[order])
+    x, y, scale, noise = (np.bincount(group, v) / count for v in means)
     cells = np.column_stack([x + base[0], y + base[1], group_median(group, X[:, 2])])
-    return PairCells(cells, scale, _borne_out(cells, scale, known_map))
+    return PairCells(cells, scale, _borne_out(cells, scale, known_map), noise)
 
 
 def _borne_out(X: Array, metres_per_px: Array, known: Array) -> Mask:

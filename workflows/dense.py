@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..tasks import dense, dense_cells, laser, tiepoints
+from ..tasks import dense, dense_cells, dense_refine, laser, tiepoints
 from ..tasks.dense_cells import PairCells
 from . import extract, match, solve
 from .job import Done, Made, code_version, load, once, stage
@@ -85,9 +85,12 @@ def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
     sights = [dense.sight(camera, made, poses.R_local_camera[k], k == j) for k in (i, j)]
     pixels = [view(image) for image in (pair.i, pair.j)]
     warped = [dense.warp(made, seen, *of, scale) for seen, of in zip(sights, pixels, strict=True)]
-    relief = dense.points(made, dense.disparity(made, *warped), *sights)
+    found = dense_refine.refine(dense.disparity(made, *warped), *warped)
+    relief = dense.points(made, found, *sights)
     to_map = m.frame.map_from_local
-    cells = dense_cells.reduce_to_cells(to_map(relief.X_local), relief.metres_per_px, to_map(known), m.cell_m)
+    cells = dense_cells.reduce_to_cells(
+        to_map(relief.X_local), relief.metres_per_px, relief.noise_px, to_map(known), m.cell_m
+    )
     return Made(cells._asdict(), {"cells": len(cells.X_map)})
 
 

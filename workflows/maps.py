@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..tasks import gridding, grids, surface
+from ..tasks import gridding, grids, smooth, surface
 from ..tasks.gridding import LASER, MATCHING, Cells, Soundings
 from ..tasks.grids import Grid
 from ..tasks.surface import Growth
@@ -19,7 +19,8 @@ _VERSION = code_version(sys.modules[__name__])
 _LEAST_HALO = 6  # cells
 # Of the variance of matching: what is a cell's own, what a pair's poses do to all of its cells, and what neighbouring
 # pairs have in common, as they share images and the bend of the whole, so that it does not average down
-_OWN, _SHARED, _BEND = 0.25, 0.35, 0.4
+_SHARED, _BEND = 0.35, 0.4
+_LEAST_NOISE_PX = 0.02
 
 
 def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
@@ -96,7 +97,8 @@ def _dense(m: MapJob, pair: Pair, images: int, dense_px: float) -> Soundings:
     """One sounding a cell, numbered as one more frame for the pair: what it errs by is its poses', mostly."""
     cells = dense.read_cells(m, pair.dense)
     sigma, number = dense_px * cells.metres_per_px, images * (pair.i + 1) + pair.j
-    found = _soundings(cells.X_map, np.sqrt(_OWN) * sigma, MATCHING, number, np.sqrt(_SHARED) * sigma)
+    noise = np.maximum(cells.noise_px, _LEAST_NOISE_PX) * cells.metres_per_px
+    found = _soundings(cells.X_map, noise, MATCHING, number, np.sqrt(_SHARED) * sigma)
     return found._replace(doubtful=~cells.borne_out)
 
 
@@ -144,6 +146,7 @@ def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]]) -> Cells:
     empty = Cells(
         elevation=np.full(grid.shape, np.nan),
         sigma=np.full(grid.shape, np.nan),
+        noise=np.full(grid.shape, np.nan),
         density=np.zeros(grid.shape, np.int32),
         source=np.zeros(grid.shape, np.uint8),
         x=np.full(grid.shape, np.nan),
@@ -153,7 +156,7 @@ def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]]) -> Cells:
         entry = load(job, CELLS, done.key)
         for name, values in empty._asdict().items():
             paste(grid, values, tile, entry.arrays[name])
-    return empty
+    return smooth.matched(grid, empty)
 
 
 def paste(grid: Grid, values: np.ndarray, tile: Grid, part: np.ndarray) -> None:
