@@ -24,7 +24,6 @@ _IMAGES_KEPT = 4
 _WITHIN_CELLS = 0.5
 # where no laser tells: half a pixel of dense matching, which is on smaller images, and one of tie points
 _DENSE_PX, _TIE_PX, _UNKNOWN_M = 0.5, 1.0, 1.0
-_NO_DIFFERENCES = dense_cells.Differences(np.zeros(0), np.zeros(0))
 
 
 class DensePair(NamedTuple):
@@ -130,16 +129,17 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
     solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
 
     def make() -> Made:
-        dense_off, tie_off = [_NO_DIFFERENCES], [_NO_DIFFERENCES]
+        dense_off, tie_off = [dense_cells.NO_DIFFERENCES], [dense_cells.NO_DIFFERENCES]
         for pair, key, around in pairs:
             to_map, within = m.frame.map_from_local, _WITHIN_CELLS * m.cell_m
-            lit = to_map(np.concatenate([sounded(m, image, solution) for image in around]))
+            lit = [to_map(sounded(m, image, solution)) for image in around]
             ties = _ties(m, pair, solution)
-            tie_off.append(dense_cells.differences(to_map(ties.X_local), ties.metres_per_px, lit, within))
+            there = to_map(ties.X_local)
+            tie_off.append(dense_cells.differences(there, ties.metres_per_px, np.concatenate(lit), within))
             if key:
                 cells = read_cells(m, key)
-                sure = cells.borne_out
-                dense_off.append(dense_cells.differences(cells.X_map[sure], cells.metres_per_px[sure], lit, within))
+                X, scale = cells.X_map[cells.borne_out], cells.metres_per_px[cells.borne_out]
+                dense_off += [dense_cells.departures(X, scale, soundings, m.cell_m) for soundings in lit]
         dense_m, dense_px = (np.concatenate(values) for values in zip(*dense_off, strict=True))
         tie_m, tie_px = (np.concatenate(values) for values in zip(*tie_off, strict=True))
         found = {
@@ -148,6 +148,7 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
             "laser_m": dense_cells.share_of_each(dense_m if len(dense_m) else tie_m, _UNKNOWN_M),
         }
         found["bend_m"] = found["laser_m"] if found["laser_m"] < _UNKNOWN_M else 0.0
+        if __import__("os").environ.get("DBG"): print(found)
         return Made({}, {name: round(value, 4) for name, value in found.items()})
 
     rows = sorted({image.row for pair, _, around in pairs for image in (pair.i, pair.j, *around)})

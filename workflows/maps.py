@@ -17,9 +17,9 @@ from .solve import Solution
 CELLS, GROWTH, SURFACE = "cells", "growth", "surface"
 _VERSION = code_version(sys.modules[__name__])
 _LEAST_HALO = 6  # cells
-# Of the variance of matching: what is a cell's own, what a pair's poses do to all of its cells, and what neighbouring
-# pairs have in common, as they share images and the bend of the whole, so that it does not average down
-_SHARED, _BEND = 0.35, 0.4
+# Of the variance that poses give to matching: what a pair's poses do to all of its cells, and what neighbouring pairs
+# have in common, as they share images and the bend of the whole, so that it does not average down
+_SHARED, _BEND = 0.5, 0.5
 _LEAST_NOISE_PX = 0.02
 
 
