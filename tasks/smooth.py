@@ -16,7 +16,9 @@ from .grids import Grid, cell_centres
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_RADII = (1, 2, 3, 5)  # cells
+_RADII = (1, 2, 4)  # cells
+_SPARSE = 2  # beyond this radius every second cell each way says enough
+_NOISE_M = 1e-3  # of weight one, so that single precision does
 _INTERVAL = 2.0  # sigmas
 _LEAST_CELLS = 6
 _SPIKE_CELLS = 5  # neighbours that can tell a cell that it stands out
@@ -41,7 +43,7 @@ class _Moments(NamedTuple):
 def matched(grid: Grid, cells: Cells) -> Cells:
     """Cells with matched ones smoothed and carried to their centres; those of the laser as they are.
 
-    A cell depends on those within `HALO` cells of it and on nothing else.
+    A cell depends on those within four cells of it and on nothing else.
     """
     wanted = cells.source == MATCHING
     if not wanted.any():
@@ -50,19 +52,24 @@ def matched(grid: Grid, cells: Cells) -> Cells:
     x, y = (cells.x - X) / grid.cell_m, (cells.y - Y) / grid.cell_m
     z = np.where(wanted, _without_spikes(cells.elevation), cells.elevation)
     known = cells.density > 0
-    weight = np.where(known, 1 / np.maximum(cells.noise, 1e-5) ** 2, 0.0)
+    weight = np.where(known, (_NOISE_M / np.maximum(cells.noise, 1e-5)) ** 2, 0.0)
     found, noise = z.copy(), cells.noise.copy()
     low, high = np.full(grid.shape, -np.inf), np.full(grid.shape, np.inf)
     going, at_centre, last = wanted.copy(), np.zeros(grid.shape, bool), 0
-    sums = _Moments(*(np.zeros(grid.shape) for _ in _Moments._fields))
-    count = np.zeros(grid.shape)
+    uneven = np.ones(grid.shape)
+    sums = _Moments(*(np.zeros(grid.shape, np.float32) for _ in _Moments._fields))
+    count = np.zeros(grid.shape, np.float32)
+    layers = [np.nan_to_num(values).astype(np.float32) for values in (x, y, weight)]
     for radius in _RADII:
-        _add_ring(sums, count, (last, radius), np.nan_to_num(z), np.nan_to_num(x), np.nan_to_num(y), weight)
+        _add_ring(sums, count, (last, radius), np.nan_to_num(z), *layers)
         last = radius
         height, variance, misfit = _plane(sums, count)
+        if radius == _RADII[0]:
+            torn = (count >= _LEAST_CELLS) & (misfit > _CHI_SQUARED)
+            uneven = np.sqrt(np.where(torn, misfit, 1))
         enough = going & (count >= _LEAST_CELLS) & np.isfinite(height) & (variance > 0)
         height = np.where(enough, height, 0.0)
-        spread = np.where(enough, _INTERVAL * np.sqrt(np.where(enough, variance, 0)), 0)
+        spread = _INTERVAL * np.sqrt(np.where(enough, variance, 0))
         low, high = (
             np.where(enough, np.maximum(low, height - spread), low),
             np.where(enough, np.minimum(high, height + spread), high),
@@ -72,6 +79,8 @@ def matched(grid: Grid, cells: Cells) -> Cells:
         found[better], noise[better] = (z + height)[better], np.sqrt(variance[better])
         at_centre |= better
         going &= better | ~enough
+    # what neighbours differ by, beyond what noise makes them, no plane explains: edges, flanks, wrong matches
+    noise *= uneven
     sigma = np.sqrt(np.maximum(cells.sigma**2 - cells.noise**2, 0) + noise**2)
     return cells._replace(
         elevation=found,
@@ -100,16 +109,19 @@ def _add_ring(
     """Adds the cells between two squares to the sums, in place; with the smaller of radius 0 also the cell itself."""
     inner, outer = radii
     height, width = z.shape
-    for i in range(-outer, outer + 1):
-        for j in range(-outer, outer + 1):
+    every = _SPARSE if outer > _SPARSE else 1
+    for i in range(-outer, outer + 1, every):
+        for j in range(-outer, outer + 1, every):
             if inner and max(abs(i), abs(j)) <= inner:
                 continue
             here = slice(max(0, -i), height - max(0, i)), slice(max(0, -j), width - max(0, j))
             there = slice(max(0, i), height + min(0, i)), slice(max(0, j), width + min(0, j))
             # rows go south
-            w, dx, dy, dz = weight[there], x[there] + j, y[there] - i, z[there] - z[here]
-            terms = (w, w * dx, w * dy, w * dx * dx, w * dx * dy, w * dy * dy, w * dz)
-            for total, term in zip(sums, (*terms, terms[1] * dz, terms[2] * dz, terms[6] * dz), strict=True):
+            w, dx, dy = weight[there], x[there] + j, y[there] - i
+            dz = (z[there] - z[here]).astype(np.float32)
+            wx, wy, wz = w * dx, w * dy, w * dz
+            terms = (w, wx, wy, wx * dx, wx * dy, wy * dy, wz, wx * dz, wy * dz, wz * dz)
+            for total, term in zip(sums, terms, strict=True):
                 total[here] += term
             count[here] += w > 0
 
@@ -123,6 +135,6 @@ def _plane(m: _Moments, count: Array) -> tuple[Array, Array, Array]:
         slope_x = (b * m.z + (m.one * m.yy - m.y**2) * m.xz + (m.x * m.y - m.one * m.xy) * m.yz) / determinant
         slope_y = (c * m.z + (m.x * m.y - m.one * m.xy) * m.xz + (m.one * m.xx - m.x**2) * m.yz) / determinant
         left = m.zz - height * m.z - slope_x * m.xz - slope_y * m.yz
-        return height, a / determinant, left / np.maximum(count - 3, 1)
+        return height, _NOISE_M**2 * a / determinant, left / _NOISE_M**2 / np.maximum(count - 3, 1)
 
 
