@@ -42,9 +42,7 @@ class PairCells(NamedTuple):
 NO_CELLS = PairCells(np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool), np.zeros(0))
 
 
-def reduce_to_cells(
-    X_map: Array, metres_per_px: Array, noise_px: Array, known_map: Array, cell_m: float
-) -> PairCells:
+def reduce_to_cells(X_map: Array, metres_per_px: Array, noise_px: Array, known_map: Array, cell_m: float) -> PairCells:
     """Cells of the points (N, 3) of a pair, map coordinates; known_map : (K, 3) laser and tie points around."""
     key = np.floor(X_map[:, :2] / cell_m).astype(np.int64)
     order = np.lexsort((X_map[:, 2], key[:, 0], key[:, 1]))

@@ -127,7 +127,7 @@ def _add_ring(
 
 
 def _plane(m: _Moments, count: Array) -> tuple[Array, Array, Array]:
-    """Of the planes that fit: height at the cell's centre over the cell's value, its variance, chi squared a freedom."""
+    """Of the planes that fit: height at the cell's centre over its value, its variance, chi squared over freedom."""
     a, b, c = m.xx * m.yy - m.xy**2, m.xy * m.y - m.x * m.yy, m.x * m.xy - m.xx * m.y
     with np.errstate(divide="ignore", invalid="ignore"):
         determinant = m.one * a + m.x * b + m.y * c
@@ -136,5 +136,3 @@ def _plane(m: _Moments, count: Array) -> tuple[Array, Array, Array]:
         slope_y = (c * m.z + (m.x * m.y - m.one * m.xy) * m.xz + (m.one * m.xx - m.x**2) * m.yz) / determinant
         left = m.zz - height * m.z - slope_x * m.xz - slope_y * m.yz
         return height, _NOISE_M**2 * a / determinant, left / _NOISE_M**2 / np.maximum(count - 3, 1)
-
-

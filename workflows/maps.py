@@ -71,7 +71,9 @@ def relative(solution: Solution, measured_m: float) -> Solution:
 def _bend_m(solution: Solution, agreed: Done) -> float:
     """1-sigma of the elevation by the poses, as neighbouring images share it; 0 where nothing tells."""
     held = np.array([status == "adjusted" for status in solution.status], bool) & solution.poses.known
-    return float(np.median(solution.sigma_m[held, 2])) if held.any() and agreed.info["bend_m"] else 0.0
+    return (
+        float(np.median(solution.sigma_m[held, 2])) if held.any() and agreed.info["laser_m"] < dense.UNKNOWN_M else 0.0
+    )
 
 
 def _soundings(X_map: np.ndarray, sigma: np.ndarray, source: int, frame: int, shared: np.ndarray) -> Soundings:
