@@ -17,6 +17,7 @@ Pixels = NDArray[np.uint8]
 
 _WINDOW = (9, 9)
 _ROUNDS = 3
+_FINER = np.float32(4)  # OpenCV looks up at 32nds of a pixel, and its cubic is a 25th of a pixel off between pixels
 _LONGEST_STEP_PX = 0.5  # of a round
 _FARTHEST_PX = 1.0  # from where semi-global matching put it; what goes farther found another place
 _SAME_SURFACE_PX = 1.0  # neighbours that differ by more lie on another surface
@@ -40,11 +41,14 @@ def refine(found: Array, first: tuple[Pixels, Mask], second: tuple[Pixels, Mask]
     start = np.nan_to_num(found).astype(np.float32)
     disparity = _smoothed(start, weight)
     one, other = first[0].astype(np.float32), second[0].astype(np.float32)
+    size = int(_FINER) * other.shape[1], other.shape[0]
+    finer = cv2.resize(other, size, interpolation=cv2.INTER_LANCZOS4)
     row, column = np.mgrid[: found.shape[0], : found.shape[1]].astype(np.float32)
     share = np.maximum(cv2.blur(weight, _WINDOW), 1e-3)
     texture, left = np.zeros_like(start), np.zeros_like(start)
     for _ in range(_ROUNDS):
-        there = cv2.remap(other, column - disparity, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        at = (column - disparity + 0.5) * _FINER - 0.5
+        there = cv2.remap(finer, at, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         slope, off = _gradient(one + there) * weight, (there - one) * weight
         # without the window's mean: beside an image's rim the two are not evened alike
         mean, mean_off = cv2.blur(slope, _WINDOW) / share, cv2.blur(off, _WINDOW) / share

@@ -22,7 +22,7 @@ _NOISE_M = 1e-3  # of weight one, so that single precision does
 _INTERVAL = 2.0  # sigmas
 _LEAST_CELLS = 6
 _SPIKE_CELLS = 5  # neighbours that can tell a cell that it stands out
-_CHI_SQUARED = 1.6  # over its freedom: more is no plane
+_CHANCE = 3.0  # sigmas of chi squared over its freedom: more is no plane
 
 
 class _Moments(NamedTuple):
@@ -65,7 +65,7 @@ def matched(grid: Grid, cells: Cells) -> Cells:
         last = radius
         height, variance, misfit = _plane(sums, count)
         if radius == _RADII[0]:
-            torn = (count >= _LEAST_CELLS) & (misfit > _CHI_SQUARED)
+            torn = wanted & (count >= _LEAST_CELLS) & (misfit > _most(count))
             uneven = np.sqrt(np.where(torn, misfit, 1))
         enough = going & (count >= _LEAST_CELLS) & np.isfinite(height) & (variance > 0)
         height = np.where(enough, height, 0.0)
@@ -74,7 +74,7 @@ def matched(grid: Grid, cells: Cells) -> Cells:
             np.where(enough, np.maximum(low, height - spread), low),
             np.where(enough, np.minimum(high, height + spread), high),
         )
-        even = (misfit < _CHI_SQUARED) & (low <= high) & (height >= low) & (height <= high)
+        even = (misfit < _most(count)) & (low <= high) & (height >= low) & (height <= high)
         better = enough & even
         found[better], noise[better] = (z + height)[better], np.sqrt(variance[better])
         at_centre |= better
@@ -89,6 +89,11 @@ def matched(grid: Grid, cells: Cells) -> Cells:
         x=np.where(at_centre, X, cells.x),
         y=np.where(at_centre, Y, cells.y),
     )
+
+
+def _most(count: Array) -> Array:
+    """Chi squared over its freedom that so many cells on a plane have by chance at most."""
+    return 1 + _CHANCE * np.sqrt(2 / np.maximum(count - 3, 1))
 
 
 def _without_spikes(z: Array) -> Array:
