@@ -276,8 +276,11 @@ def _write_truth(folder: Path, made: _Made) -> None:
         truth |= {"L0": laser.origin, "planes": [[*s.normal, s.offset] for s in laser.sheets]}
     (folder / "truth.json").write_text(json.dumps(truth))
     t = made.terrain
-    period = {"period": made.scene.period_m} if made.scene.period_m else {}
-    np.savez_compressed(folder / "terrain.npz", h=t.h, half=t.half_m, cell=t.cell_m, depth=t.depth_m, **period)
+    grid = {"h": t.h, "half": t.half_m, "cell": t.cell_m, "depth": t.depth_m}
+    if made.scene.period_m:
+        grid["period"] = made.scene.period_m
+    with (folder / "terrain.npz").open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **{name: np.asarray(value) for name, value in grid.items()})
     _write_jpeg(folder / "texture.jpg", made.texture, _TEXTURE_QUALITY)
 
 
