@@ -77,7 +77,7 @@ def simulate(
     scene: Annotated[
         str,
         typer.Argument(
-            metavar="SCENE", help="plane, box, pool, reef, sea, night, pairs, sand, port, floor, full or demo."
+            metavar="SCENE", help="plane, box, pool, reef, sea, night, pairs, sand, port, floor, demo or full."
         ),
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A new folder.")],
