@@ -45,11 +45,16 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     enough = _LEAST_SEEN if p.grid.max_sigma_m == "auto" else 1.0
     m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst, enough)
     outlines = _outlines(state, posed.solution, ranges)
-    linked, agreed = _dense(state, m, posed, images, outlines, ranges)
+    # what is costly does not change with the bathymetry's cell: matching is kept as fine as either of the cells, and
+    # mosaics lie on a surface of their own
+    usual = grids.bathymetry_cell_m(gsd)
+    linked, agreed = _dense(state, m._replace(cell_m=min(cell, usual)), posed, images, outlines, ranges)
     surface_tiles = _surface(state, m, linked, agreed, images, outlines)
+    below = m._replace(cell_m=usual)
+    ground = surface_tiles if below == m else _surface(state, below, linked, agreed, images, outlines)
     textured = [image for image in images if image.texture]
-    light = _lighting(state, m, textured)
-    mosaic = _mosaics(state, m, textured or images, outlines, surface_tiles, mosaic_cell, light, posed)
+    light = _lighting(state, below, textured)
+    mosaic = _mosaics(state, below, textured or images, outlines, ground, mosaic_cell, light, posed)
     return Mapped(m, cell, mosaic_cell, surface_tiles, mosaic, outlines)
 
 
@@ -185,7 +190,9 @@ def _surface(
     tiles = list(grids.tiles(grid, size))
     touching = [_touching(outlines, images, tile, margin) for tile in tiles]
     cell_tasks = [
-        delayed(maps.cells_tile)(m, Tile(tile, seen, _of_images(linked, seen)), agreed, dask_key_name=f"cells-{k}")
+        delayed(maps.cells_tile)(
+            m, Tile(tile, seen, _of_images(linked, seen)), agreed, dask_key_name=f"cells-{m.cell_m:g}-{k}"
+        )
         for k, (tile, seen) in enumerate(zip(tiles, touching, strict=True))
     ]
     cells: list[Done] = compute(state, maps.CELLS, cell_tasks)
@@ -199,9 +206,10 @@ def _surface(
     count = max(1, _GROWTH_CELLS // (size * size))
     order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:count]
     samples = [maps.Sample(tiles[k], around[k], outlines[[image.row for image in touching[k]]]) for k in sorted(order)]
-    (growth,) = compute(state, maps.GROWTH, [delayed(maps.fit_growth)(m, samples, dask_key_name="growth")])
+    task = delayed(maps.fit_growth)(m, samples, dask_key_name=f"growth-{m.cell_m:g}")
+    (growth,) = compute(state, maps.GROWTH, [task])
     surface_tasks = [
-        delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=f"surface-{k}")
+        delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=f"surface-{m.cell_m:g}-{k}")
         for k, (tile, near) in enumerate(zip(tiles, around, strict=True))
     ]
     surfaces: list[Done] = compute(state, maps.SURFACE, surface_tasks)
