@@ -14,7 +14,8 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from . import gaussian_fit
-from .laser_colour import averaged_linear, laser_light, linear_light, running_median, white_pixels
+from .laser_colour import laser_light, linear_light, white_pixels
+from .medians import median, running_median
 from .sheet_search import Arms, Piece
 
 Array = NDArray[np.float64]
@@ -238,11 +239,13 @@ def _typical_width(image: NDArray[np.uint8], v: Indices, centre: Indices, box_px
     x = np.arange(-half, half + 1)
     sigma = half / 3
     for _ in range(12):
-        wide = 1.5 * sigma
+        before, wide = sigma, 1.5 * sigma
         weight = np.maximum(profile, 0) * np.exp(-0.5 * (x / wide) ** 2)
         spread = float((weight * x**2).sum() / max(weight.sum(), 1e-12))
         # the weight narrows a Gaussian profile: 1/spread = 1/sigma^2 + 1/wide^2
-        sigma = np.sqrt(1 / max(1 / max(spread, 0.05) - 1 / wide**2, (1.5 / half) ** 2))
+        sigma = float(np.sqrt(1 / max(1 / max(spread, 0.05) - 1 / wide**2, (1.5 / half) ** 2)))
+        if abs(sigma - before) < 0.01 * sigma:
+            break
     return float(np.clip(sigma, 0.6, half / 1.5))
 
 
@@ -258,14 +261,14 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
         columns = 1
     half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
     level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
-    green, shine = _green(level), averaged_linear(level, columns, linear)
-    used, unclipped = _all(inside, columns).T, _all(green < _CLIPPED, columns).T
-    used = used & ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns).T
-    light = laser_light(shine, gaussian_fit.GROUND * width / columns)
+    green, shine = _green(level), np.asarray(cv2.LUT(level, linear), np.float32)
+    used, unclipped = _all(inside, columns), _all(green < _CLIPPED, columns)
+    used &= ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns)
+    light = laser_light(shine, gaussian_fit.GROUND * width, columns)
     light -= gaussian_fit.ground(light, used, width / columns)
     if image.ndim == 3:
-        used &= ~white_pixels(shine, light)
-    typical = int(np.median(green[::7, ::3]))
+        used &= ~white_pixels(shine, light, columns)
+    typical = int(median(green[::7, ::3]))
     floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
     found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
@@ -283,23 +286,24 @@ def _near_end(rows: _Rows, u: Array, width: Array) -> NDArray[np.bool_]:
     """
     broken = ~(np.abs(np.diff(u)) < 3 * width[1:]) | (np.diff(rows.v) != 1)
     edge = np.concatenate([[True], broken, [True]])
-    reach = 2 * int(np.ceil(np.median(width))) + 1
+    reach = 2 * int(np.ceil(median(width))) + 1
     near = cv2.dilate(edge.astype(np.uint8)[None], np.ones((1, reach), np.uint8))[0]
     return (near[1:] | near[:-1]).astype(bool)
 
 
 def _all(pixels: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:
-    """Which groups (N, M) of columns of (N, columns M) are true in every column."""
-    if columns == 1:
-        return pixels
-    return np.logical_and.reduce([pixels[:, k::columns] for k in range(columns)])
+    """Which groups (M, N) of columns of (N, columns M) are true in every column."""
+    upright = cv2.transpose(pixels.view(np.uint8))
+    if columns > 1:
+        upright = upright.reshape(-1, columns, len(pixels)).min(axis=1)
+    return np.asarray(upright).view(bool)
 
 
 def _lit_by_other(apart: Array, half: int, reach: float) -> NDArray[np.bool_]:
-    """Pixels (N, 2 half + 1) on which the other arm, so far from the middle (N,), shines."""
-    lit = np.zeros((len(apart), 2 * half + 1), bool)
+    """Pixels (2 half + 1, N) on which the other arm, so far from the middle (N,), shines."""
+    lit = np.zeros((2 * half + 1, len(apart)), bool)
     near = np.flatnonzero(np.abs(apart) < half + reach)
-    lit[near] = np.abs(np.arange(-half, half + 1) - apart[near, None]) < reach
+    lit[:, near] = np.abs(np.arange(-half, half + 1)[:, None] - apart[near]) < reach
     return lit
 
 
@@ -316,7 +320,7 @@ def _scatter_over_sigma(line: Line) -> float:
     """By how much points scatter about their neighbours on the line, over their sigmas: speckle is not in these."""
     u, v, variance = line.uv[:, 0], line.uv[:, 1], line.sigma_px**2
     # farther apart than speckle and stones reach
-    lag = max(_LAG_ROWS, round(_LAG_WIDTHS * float(np.median(line.width_px)))) if len(u) else _LAG_ROWS
+    lag = max(_LAG_ROWS, round(_LAG_WIDTHS * median(line.width_px))) if len(u) else _LAG_ROWS
     if len(u) <= 4 * lag + 20:
         return 1.0
     # a fourth difference: curved bottom is no scatter
@@ -329,5 +333,5 @@ def _scatter_over_sigma(line: Line) -> float:
     expected = np.sum([w**2 * variance[part] for w, part in zip(weight, at, strict=True)], axis=0)
     square = off[even] ** 2 / expected[even]
     # median of a squared normal variable: 0.4549 of its variance; speckle has longer tails, which count up to 3 sigma
-    usual = float(np.median(square)) / 0.4549
+    usual = median(square) / 0.4549
     return float(np.clip(np.sqrt(np.minimum(square, 9 * usual).mean() / 0.991), 0.7, 20))

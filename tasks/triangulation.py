@@ -268,9 +268,10 @@ def _crossing(arms: list[Array]) -> float | None:
 
 def _value_at_zero(along: Array, depth: Array) -> tuple[float, float]:
     """Depth at 0 of the straight line through points (N,), and its 1-sigma."""
-    design = np.column_stack([np.ones(len(along)), along])
-    value, *_ = np.linalg.lstsq(design, depth, rcond=None)
-    off = (depth - design @ value)[np.argsort(along, kind="stable")]
+    middle, mean = along.mean(), depth.mean()
+    spread = ((along - middle) ** 2).sum()
+    slope = ((along - middle) * (depth - mean)).sum() / max(spread, 1e-18)
+    off = (depth - mean - slope * (along - middle))[np.argsort(along, kind="stable")]
     alike = float(np.clip((off[1:] * off[:-1]).sum() / max((off**2).sum(), 1e-18), 0.0, _MOST_ALIKE))
     scatter = off.std() * np.sqrt((1 + alike) / (1 - alike))
-    return float(value[0]), float(scatter * np.sqrt(np.linalg.inv(design.T @ design)[0, 0]))
+    return float(mean - slope * middle), float(scatter * np.sqrt(1 / len(along) + middle**2 / max(spread, 1e-18)))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from seamosaic.schemas.parameters import LaserParameters
-from seamosaic.tasks import laser_colour, triangulation
+from seamosaic.tasks import laser_colour, medians, triangulation
 
 from tests.tasks.laser_scenes import COLOUR, LIGHT, WHITE, camera, columns, encoded
 from tests.tasks.test_laser_hostile import bottom
@@ -57,4 +57,4 @@ def test_evidence_has_the_laser_and_not_the_texture():
 def test_running_median_keeps_to_most():
     height = np.full(200, 0.3)
     height[50:58] = 3.0
-    assert laser_colour.running_median(height) == pytest.approx(0.3, rel=0.05)
+    assert medians.running_median(height) == pytest.approx(0.3, rel=0.05)
