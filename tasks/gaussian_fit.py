@@ -79,23 +79,23 @@ class _State(NamedTuple):
     normals: tuple[NDArray, NDArray, NDArray]
 
 
-def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> Fit:
+def fit(light: Floats, mask: Floats, width: float, floor: float) -> Fit:
     """Fit a Gaussian to each profile, nearly in its middle already and on no ground.
 
     Parameters
     ----------
     light : (M, N) profiles, M odd; neighbours in N are neighbours on the line.
-    used : (M, N) pixels to use.
+    mask : (M, N) 1 for pixels to use, 0 for others.
     width : standard deviation of most, pixels.
     floor : variance that pixels have at least: that of rounding to levels.
     """
     half = len(light) // 2
-    x, mask = np.arange(-half, half + 1, dtype=np.float32)[:, None], used.astype(np.float32, order="C")
+    x = np.arange(-half, half + 1, dtype=np.float32)[:, None]
     reach = min(int(1.2 * FIT * width) + 1, half)
     core = slice(half - reach, half + reach + 1)
     state = _first(light[core], x[core], width)
     noise = _Noise(floor, 0.0, 0.0, max(median(state.height), 1e-9))
-    steps = _STEPS if np.count_nonzero(used[half]) > 0.5 * used.shape[1] else _STEPS_CLIPPED
+    steps = _STEPS if np.count_nonzero(mask[half]) > 0.5 * mask.shape[1] else _STEPS_CLIPPED
     for k in range(steps):
         state = _improved(state, light[core], mask[core], x[core], noise, last=k == steps - 1)
         if k == steps - 2:
@@ -108,20 +108,25 @@ def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> F
     return Fit(*(np.asarray(part, float) for part in (state.place, sigma, state.width, snr, state.height, misfit)))
 
 
-def ground(light: Floats, used: NDArray[np.bool_], width: float) -> Floats:
-    """Straight lines (M, N) through what lies to both sides of each profile (M, N), averaged over some of them."""
+def ground(light: Floats, mask: Floats, width: float) -> Floats:
+    """Straight lines (M, N) through what lies to both sides of each profile (M, N), averaged over some of them.
+
+    mask : (M, N) 1 for pixels to use, 0 for others.
+    """
     half = len(light) // 2
     x = np.arange(-half, half + 1, dtype=np.float32)
     mean, place = [], []
     for side in (x < -GROUND * width, x > GROUND * width):
         part = slice(*np.flatnonzero(side)[[0, -1]] + [0, 1])
-        seen = used[part].astype(np.float32)
-        count, total = _along(seen.sum(axis=0), _GROUND_ROWS), _along(_dot(light[part], seen), _GROUND_ROWS)
-        mean.append(np.where(count > 1e-3, total / np.maximum(count, 1e-3), np.nan))
+        count = _along(mask[part].sum(axis=0), _GROUND_ROWS)
+        total = _along(_dot(light[part], mask[part]), _GROUND_ROWS)
+        mean.append((total / np.maximum(count, np.float32(1e-3)), count > 1e-3))
         place.append(float(x[side].mean()))
-    left, right = (np.where(np.isnan(a), np.where(np.isnan(b), 0, b), a) for a, b in (mean, mean[::-1]))
+    (left, seen_left), (right, seen_right) = mean
+    # a side that is not seen is thought to be as the other; where neither is there is no ground
+    left, right = np.where(seen_left, left, right * seen_right), np.where(seen_right, right, left * seen_left)
     share = (x[:, None] - np.float32(place[0])) / np.float32(place[1] - place[0])
-    return np.asarray(left + (right - left) * share, np.float32)
+    return np.asarray((right - left) * share + left, np.float32)
 
 
 def _dot(a: NDArray, b: NDArray) -> NDArray:

@@ -343,9 +343,9 @@ def glow(image_bgr: NDArray[np.uint8], line_uv: Array, halfwidth_px: float, patc
     small = cv2.resize(image_bgr[:rows, :columns], (width, height), interpolation=cv2.INTER_AREA)
     # eight grey levels keep the noise of a dark image from counting as colour; 64 makes no colour a quarter of 255
     blue, green, red = (small[..., k].astype(np.float32) + 8 for k in range(3))
-    ratio = np.clip(128 * green / (blue + red), 0, 255).astype(np.uint8)
-    # of every other patch: the median of a fifth of the image
-    around = cv2.medianBlur(np.ascontiguousarray(ratio[::2, ::2]), min(width, height) // 10 | 1)
+    ratio = np.minimum(128 * green / (blue + red), 255).astype(np.uint8)
+    # of every third patch: the median of a fifth of the image
+    around = cv2.medianBlur(np.ascontiguousarray(ratio[::3, ::3]), min(width, height) // 15 | 1)
     around = cv2.resize(around, (width, height), interpolation=cv2.INTER_NEAREST)
     patch = cv2.connectedComponents((ratio > 1.15 * around).astype(np.uint8), connectivity=8)[1]
     drawn = _discs((height, width), (line_uv + 0.5) / scale - 0.5, halfwidth_px / scale[0])

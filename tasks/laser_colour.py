@@ -16,6 +16,8 @@ _LASER_BGR: Final = np.array([0.2, 1.0, 0.15])
 _COLOUR_DOUBT: Final = 0.003
 # Channels that differ by no more than this share of the light have no colour.
 _GREY: Final = 0.02
+# Far less than the variance of rounding to levels.
+_TINY: Final = 1e-12
 _CLIPPED: Final = 252
 # Blue and red, as a share of the line's green, that the laser does not have; and over their scatter.
 _WHITE: Final = 0.4
@@ -32,7 +34,9 @@ def linear_light(gamma: float) -> Floats:
 
 def _colourless(light: Floats) -> bool:
     """Whether all channels of some linear light (..., 3) are the same: a grey image in colour."""
-    return bool(np.abs(light[..., ::2] - light[..., 1:2]).mean() <= _GREY * light.mean())
+    blue, green, red = np.ascontiguousarray(light.reshape(-1, 3).T)
+    differ = np.abs(blue - green).mean() + np.abs(red - green).mean()
+    return bool(1.5 * differ <= _GREY * (blue.mean() + green.mean() + red.mean()))
 
 
 def _weights(rough: NDArray) -> Floats:
@@ -46,7 +50,8 @@ def _weights(rough: NDArray) -> Floats:
     limit = np.array([[4.5 * median(size) + 1e-5] for size in np.abs(rough)], np.float32)
     rough = np.minimum(np.maximum(rough, -limit), limit)
     scatter = (rough @ rough.T / rough.shape[1]).astype(float)
-    weight = np.linalg.solve(scatter + _COLOUR_DOUBT * scatter[1, 1] * np.eye(3), _LASER_BGR)
+    scatter.ravel()[::4] += _COLOUR_DOUBT * scatter[1, 1] + _TINY
+    weight = cv2.solve(scatter, _LASER_BGR[:, None], flags=cv2.DECOMP_CHOLESKY)[1].ravel()
     return (weight / (weight @ _LASER_BGR)).astype(np.float32)
 
 
@@ -117,5 +122,3 @@ def white_pixels(shine: Floats, light: Floats, columns: int) -> NDArray[np.bool_
         # where most of the line is white the image has no colour
         white[:] = False
     return white
-
-

@@ -201,7 +201,7 @@ def _centred(image: NDArray[np.uint8], rows: _Rows, box_px: float, factor: int) 
     """Rough columns improved at full resolution: the strongest peak near them, of some rows together."""
     if not len(rows.v):
         return rows
-    every, columns = max(1, factor // 2), 1 + 2 * int(box_px / 8)
+    every, columns = max(1, 2 * factor // 3), 1 + 2 * int(box_px / 8)
     reach, wide = factor // columns + 1, int(np.ceil(1.5 * box_px / columns)) + 1
     v, centre = rows.v[::every], np.round(rows.u[::every]).astype(np.intp)
     half = reach + wide
@@ -235,7 +235,7 @@ def _typical_width(image: NDArray[np.uint8], v: Indices, centre: Indices, box_px
     light = linear[_green(_strip(image, v[some], centre[some], half)[0])]
     ends = max(1, half // 4)
     ground = 0.5 * (light[:, :ends].mean(axis=1) + light[:, -ends:].mean(axis=1))
-    profile = np.median(light - ground[:, None], axis=0).astype(float)
+    profile = np.sort((light - ground[:, None]).T, axis=1)[:, len(light) // 2].astype(float)
     x = np.arange(-half, half + 1)
     sigma = half / 3
     for _ in range(12):
@@ -262,15 +262,15 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
     level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
     green, shine = _green(level), np.asarray(cv2.LUT(level, linear), np.float32)
-    used, unclipped = _all(inside, columns), _all(green < _CLIPPED, columns)
-    used &= ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns)
+    mask, unclipped = _all(inside, columns).astype(np.float32), _all(green < _CLIPPED, columns)
+    mask[_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns)] = 0
     light = laser_light(shine, gaussian_fit.GROUND * width, columns)
-    light -= gaussian_fit.ground(light, used, width / columns)
+    light -= gaussian_fit.ground(light, mask, width / columns)
     if image.ndim == 3:
-        used &= ~white_pixels(shine, light, columns)
+        mask *= ~white_pixels(shine, light, columns)
     typical = int(median(green[::7, ::3]))
     floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
-    found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
+    found = gaussian_fit.fit(light, mask * unclipped, width / columns, floor)
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
     share = found.height / running_median(found.height)
     strange = (share > _BRIGHT) | (found.misfit > _MISFIT)

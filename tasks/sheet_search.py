@@ -115,7 +115,8 @@ def reduce(image_bgr: NDArray[np.uint8]) -> Reduced:
     """An image (H, W[, 3]) about 600 pixels wide, of about 300 rows."""
     factor = max(1, round(image_bgr.shape[1] / _WIDTH_PX))
     row_step = max(1, round(image_bgr.shape[0] / _ROWS))
-    rows = image_bgr[(row_step - 1) // 2 :: row_step][: image_bgr.shape[0] // row_step]
+    # rows far apart in memory get into each other's way: copied once, then averaged
+    rows = np.ascontiguousarray(image_bgr[(row_step - 1) // 2 :: row_step][: image_bgr.shape[0] // row_step])
     if factor == 1:
         return Reduced(rows, 1, row_step)
     if factor % 2:
