@@ -108,6 +108,27 @@ def fit(light: Floats, mask: Floats, width: float, floor: float) -> Fit:
     return Fit(*(np.asarray(part, float) for part in (state.place, sigma, state.width, snr, state.height, misfit)))
 
 
+def misfit(light: Floats, mask: Floats, found: Fit, width: Array, floor: float) -> NDArray:
+    """Scatter squared (N,) of what Gaussians of given widths (N,) leave of profiles, over that of noise.
+
+    Parameters
+    ----------
+    light, mask, floor : as in `fit`.
+    found : what that gave.
+    """
+    half = len(light) // 2
+    x = np.arange(-half, half + 1, dtype=np.float32)[:, None]
+    place, free, height = (np.asarray(part, np.float32) for part in (found.place, found.width, found.height))
+    normals = height, height, height
+    noise = _Noise(floor, 0.0, 0.0, max(median(height), 1e-9))
+    noise = _noise(_State(place, free, height, normals), light, mask, x, noise)
+    state = _State(place, np.asarray(width, np.float32), height, normals)
+    for _ in range(_STEPS):
+        state = _improved(state, light, mask, x, noise, last=True)
+    up, down = _residuals(state, light, mask, x, noise)
+    return up / down
+
+
 def ground(light: Floats, mask: Floats, width: float) -> Floats:
     """Straight lines (M, N) through what lies to both sides of each profile (M, N), averaged over some of them.
 
@@ -250,12 +271,17 @@ def _variance(height: NDArray, gaussian: NDArray, noise: _Noise) -> NDArray:
 
 def _noise_level(state: _State, light: Floats, mask: Floats, x: Floats, noise: _Noise) -> tuple[NDArray, NDArray]:
     """Scatter of the residuals (N,) over what was expected, of some rows together; its square in each row to that."""
+    up, down = _residuals(state, light, mask, x, noise)
+    around = np.clip(_along(up, _NOISE_ROWS) / _along(down, _NOISE_ROWS), np.float32(0.3), np.float32(30))
+    return np.sqrt(around), up / down / around
+
+
+def _residuals(state: _State, light: Floats, mask: Floats, x: Floats, noise: _Noise) -> tuple[NDArray, NDArray]:
+    """Sums (N,) of the squares of the residuals over what was expected, and how many there are, two fitted less."""
     gaussian = _gaussian(state, x)[2]
     squares = light - state.height * gaussian
     squares *= squares
     squares /= _variance(state.height, gaussian, noise)
     beside = np.float32(noise.beside)
     up = _dot(np.minimum(squares, np.float32(16) * beside), mask) / beside
-    down = np.maximum(mask.sum(axis=0) - 2, np.float32(0.5))
-    around = np.clip(_along(up, _NOISE_ROWS) / _along(down, _NOISE_ROWS), np.float32(0.3), np.float32(30))
-    return np.sqrt(around), up / down / around
+    return up, np.maximum(mask.sum(axis=0) - 2, np.float32(0.5))

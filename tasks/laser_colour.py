@@ -32,11 +32,15 @@ def linear_light(gamma: float) -> Floats:
     return ((np.arange(256) / 255) ** gamma).astype(np.float32)
 
 
-def _colourless(light: Floats) -> bool:
-    """Whether all channels of some linear light (..., 3) are the same: a grey image in colour."""
-    blue, green, red = np.ascontiguousarray(light.reshape(-1, 3).T)
+def without_grey_channels(image: NDArray[np.uint8], gamma: float) -> NDArray[np.uint8]:
+    """An image (H, W[, 3]) with one channel (H, W) if all are the same: a grey image in colour."""
+    if image.ndim == 2:
+        return image
+    blue, green, red = linear_light(gamma)[image[::40, ::8].reshape(-1, 3).T]
     differ = np.abs(blue - green).mean() + np.abs(red - green).mean()
-    return bool(1.5 * differ <= _GREY * (blue.mean() + green.mean() + red.mean()))
+    if 1.5 * differ <= _GREY * (blue.mean() + green.mean() + red.mean()):
+        return np.asarray(cv2.extractChannel(image, 1), np.uint8)
+    return image
 
 
 def _weights(rough: NDArray) -> Floats:
@@ -65,8 +69,6 @@ def evidence(image: NDArray[np.uint8], gamma: float) -> Floats:
         return light
     some = np.ascontiguousarray(light[2::20])
     rough = (some - cv2.blur(some, (15, 1)))[:, ::3].reshape(-1, 3)
-    if _colourless(some):
-        return np.asarray(cv2.extractChannel(light, 1), np.float32)
     weight = _weights(rough)
     seen: Floats = np.asarray(cv2.transform(light, weight[None]), np.float32)
     if (image[::3, :, 1] >= _CLIPPED).mean() > 1e-4:
@@ -98,8 +100,7 @@ def laser_light(shine: Floats, ground_px: float, columns: int) -> Floats:
     some = shine[:: max(1, len(shine) // _SAMPLES)]
     beside = np.concatenate([cv2.reduce(part, 1, cv2.REDUCE_AVG) for part in (some[:, :ends], some[:, -ends:])], axis=1)
     rough = (beside - cv2.blur(beside, (1, _GROUND_ROWS), borderType=cv2.BORDER_REFLECT)).reshape(-1, 3)
-    weight = np.array([0, 1, 0], np.float32) if _colourless(shine[::16]) else _weights(rough)
-    return _upright(cv2.transform(shine, weight[None]), columns)
+    return _upright(cv2.transform(shine, _weights(rough)[None]), columns)
 
 
 def white_pixels(shine: Floats, light: Floats, columns: int) -> NDArray[np.bool_]:

@@ -34,6 +34,15 @@ _BRIGHT: Final = 3.0
 _FADING: Final = 0.5
 # Nor one whose profile is so much less like a line than those around it.
 _MISFIT: Final = 4.0
+# The same in grey images, of the usual misfit and brightness along an arm; and the share of such rows, of so many
+# side by side, that makes none of them believed.
+_ODD, _GREY_BRIGHT, _GREY_STOPS = 2.0, 4.0, 0.6
+_CROWD, _CROWD_ROWS = 0.2, 17
+# A stretch of line in a grey image ends where it steps aside, in widths and columns a row; shorter ones, in widths, are
+# not believed.
+_STEP_WIDTHS, _STEEPEST, _SHORT_WIDTHS = 0.7, 1.5, 12.0
+# Nor is an arm of which less than this share is seen, of the rows from its first to its last point.
+_COVERED: Final = 0.4
 # How far from the line's rough place, in widths, it may be found.
 _ASTRAY: Final = 1.2
 _LEAST_SNR: Final = 4.0
@@ -275,8 +284,50 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     share = found.height / running_median(found.height)
     strange = (share > _BRIGHT) | (found.misfit > _MISFIT)
     strange |= (share < _FADING) & unclipped[half] & _near_end(rows, np.where(strange, np.nan, u), width)
-    fit = _Fit(np.where(strange, np.nan, u), sigma, width, found.signal_to_noise)
-    return _accepted(fit, rows, image.shape[1])
+    if image.ndim == 2:
+        strange |= _unlike_the_rest(
+            found, gaussian_fit.misfit(light, mask * unclipped, found, _usual_width(found), floor)
+        )
+    fit = _accepted(_Fit(np.where(strange, np.nan, u), sigma, width, found.signal_to_noise), rows, image.shape[1])
+    return fit if image.ndim == 3 else fit._replace(u=np.where(_short(rows.v, fit), np.nan, fit.u))
+
+
+def _usual_width(found: gaussian_fit.Fit) -> Array:
+    """Width (N,) of the line along much of an arm: it changes as the range does."""
+    return running_median(found.width, max(len(found.width) // 3, 33), 64)
+
+
+def _unlike_the_rest(found: gaussian_fit.Fit, misfit: NDArray) -> NDArray[np.bool_]:
+    """Which profiles (N,) are not the line's, told by their shape, as a grey image has no colour to tell by.
+
+    Bubbles and shells that cross or lie on a line are narrower or broader than it, more than one in a window, or
+    brighter. Where there are many the others are not believed either.
+
+    misfit : (N,) scatter squared that Gaussians of the usual width leave.
+    """
+    rows = len(misfit)
+    stops = np.log2(misfit / running_median(misfit, max(rows // 3, 33), 64) + 1e-3)
+    # bubbles are in the upper half only
+    odd = stops > _ODD * (median(stops) - float(np.quantile(stops, 0.16)))
+    stops = np.abs(np.log2(np.maximum(found.height / median(found.height), 1e-3)))
+    odd |= stops > np.maximum(_GREY_BRIGHT * median(stops), _GREY_STOPS)
+    return cv2.blur(odd.astype(np.float32)[None], (_CROWD_ROWS, 1)).ravel() > _CROWD
+
+
+def _short(v: Indices, fit: _Fit) -> NDArray[np.bool_]:
+    """Points (N,) on stretches of line so short that a bubble may be all there is to them."""
+    seen = np.flatnonzero(np.isfinite(fit.u))
+    if not len(seen):
+        return np.zeros(len(v), bool)
+    width, gap = median(fit.width[seen]), np.diff(v[seen])
+    broken = (gap > _CROWD_ROWS) | (gap < 1) | (np.abs(np.diff(fit.u[seen])) > _STEP_WIDTHS * width + _STEEPEST * gap)
+    stretch = np.concatenate([[0], np.cumsum(broken)])
+    long = np.bincount(stretch)[stretch] >= _SHORT_WIDTHS * width
+    short = np.ones(len(v), bool)
+    # pieces here and there are no line
+    if long.any() and np.count_nonzero(long) > _COVERED * np.ptp(v[seen[long]]):
+        short[seen] = ~long
+    return short
 
 
 def _near_end(rows: _Rows, u: Array, width: Array) -> NDArray[np.bool_]:

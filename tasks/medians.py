@@ -13,8 +13,12 @@ def median(values: NDArray) -> float:
     return float(np.partition(values, middle, axis=None)[middle])
 
 
-def running_median(height: NDArray) -> Array:
-    """Running median (N,) of heights, over 33 rows, to a sixteenth of a stop."""
-    steps = np.minimum(np.maximum(16 * np.log2(np.maximum(height, 1e-6)) + 255, 0), 255).astype(np.uint8)
-    usual = cv2.medianBlur(steps[::4, None], 9).ravel()
-    return np.repeat(2 ** ((usual.astype(float) - 255) / 16), 4)[: len(height)]
+def running_median(height: NDArray, rows: int = 33, most: float = 1.0) -> Array:
+    """Running median (N,) of heights, over so many rows, to a sixteenth of a stop.
+
+    most : heights beyond it count as it.
+    """
+    every, top = max(1, rows // 8), 255 - 16 * np.log2(most)
+    steps = np.minimum(np.maximum(16 * np.log2(np.maximum(height, 1e-6)) + top, 0), 255).astype(np.uint8)
+    usual = cv2.medianBlur(steps[::every, None], 9).ravel()
+    return np.repeat(2 ** ((usual.astype(float) - top) / 16), every)[: len(height)]

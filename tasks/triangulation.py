@@ -9,6 +9,7 @@ from ..schemas.calibration import Camera, Laser, LaserPlane
 from ..schemas.parameters import LaserParameters
 from . import cross, laser, line_profile, sheet_search
 from .camera import normalised, project, rays
+from .laser_colour import without_grey_channels
 from .sheet_grid import on_sheets
 
 Array = NDArray[np.float64]
@@ -179,9 +180,10 @@ def sound(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters
 def _sound_sheets(
     image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters
 ) -> ImageSoundings:
-    small = sheet_search.reduce(image_bgr)
+    image = without_grey_channels(image_bgr, parameters.gamma)
+    small = sheet_search.reduce(image)
     arms = sheet_search.search(small, camera, light, parameters)
-    line = line_profile.measure(image_bgr, arms, small.factor, parameters.gamma)
+    line = line_profile.measure(image, arms, small.factor, parameters.gamma)
     if len(line.uv) < parameters.min_soundings:
         return nothing("no laser found")
     line = line.take(_apart(camera, light, line))
@@ -191,7 +193,7 @@ def _sound_sheets(
         return nothing(_no_cross(len(keep), int(keep.sum())))
     soundings = soundings.take(keep)
     every = slice(None, None, small.row_step)
-    whole = cross.whole_line(line.uv[every], line.arm[every], small.row_step, image_bgr.shape[:2])
+    whole = cross.whole_line(line.uv[every], line.arm[every], small.row_step, image.shape[:2])
     reach = _REACH_SIGMAS * float(np.median(line.width_px))
     first, pitch = small.origin_uv, small.pitch_uv
     patch = (3.0, 3.0 * small.factor / small.row_step)

@@ -50,7 +50,10 @@ def test_evidence_has_the_laser_and_not_the_texture():
     apart = np.arange(300) != 150
     assert np.median(seen[:, 150]) - np.median(seen) == pytest.approx(0.2, abs=0.02)
     assert 0.001 < seen[:, apart].std() < 0.1 * texture[..., 1].std()
-    same = laser_colour.evidence(np.repeat(image[..., 1:2], 3, axis=2), 2.2)
+    assert laser_colour.without_grey_channels(image, 2.2) is image
+    grey = laser_colour.without_grey_channels(np.repeat(image[..., 1:2], 3, axis=2), 2.2)
+    np.testing.assert_array_equal(grey, image[..., 1])
+    same = laser_colour.evidence(grey, 2.2)
     np.testing.assert_allclose(same, laser_colour.linear_light(2.2)[image[..., 1]], atol=1e-6)
 
 
