@@ -285,23 +285,17 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     strange = (share > _BRIGHT) | (found.misfit > _MISFIT)
     strange |= (share < _FADING) & unclipped[half] & _near_end(rows, np.where(strange, np.nan, u), width)
     if image.ndim == 2:
-        strange |= _unlike_the_rest(
-            found, gaussian_fit.misfit(light, mask * unclipped, found, _usual_width(found), floor)
-        )
+        usual = running_median(found.width, max(len(found.width) // 3, 33), 64)
+        strange |= _unlike_the_rest(found, gaussian_fit.misfit(light, mask * unclipped, found, usual, floor))
     fit = _accepted(_Fit(np.where(strange, np.nan, u), sigma, width, found.signal_to_noise), rows, image.shape[1])
     return fit if image.ndim == 3 else fit._replace(u=np.where(_short(rows.v, fit), np.nan, fit.u))
-
-
-def _usual_width(found: gaussian_fit.Fit) -> Array:
-    """Width (N,) of the line along much of an arm: it changes as the range does."""
-    return running_median(found.width, max(len(found.width) // 3, 33), 64)
 
 
 def _unlike_the_rest(found: gaussian_fit.Fit, misfit: NDArray) -> NDArray[np.bool_]:
     """Which profiles (N,) are not the line's, told by their shape, as a grey image has no colour to tell by.
 
-    Bubbles and shells that cross or lie on a line are narrower or broader than it, more than one in a window, or
-    brighter. Where there are many the others are not believed either.
+    A line is as wide as along much of its arm, as the range changes slowly; what bubbles and shells leave on it or
+    beside it is narrower, broader, brighter or double. Where there is much of it the rest is not believed either.
 
     misfit : (N,) scatter squared that Gaussians of the usual width leave.
     """
