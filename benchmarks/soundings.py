@@ -100,9 +100,10 @@ def row(folder: Path, every: int) -> str:
     gaps = np.array([i.gap for i in images])
     gaps = gaps[np.isfinite(gaps)]
     shares = [100 * np.mean(part) for part in (np.abs(error) > 0.01, np.abs(error) > 0.03, wrong_arm, nowhere)]
+    precision = f"{1e3 * np.median(sigma):.2f} | {1e3 * robust:.2f} | {z[np.abs(z) < 8].std():.2f}"
     return (
-        f"{folder.name} | {len(images)} | {len(error) / len(images):.0f} | {recall:.1f} | {1e3 * np.median(sigma):.2f} | "
-        f"{1e3 * robust:.2f} | {z[np.abs(z) < 8].std():.2f} | {1e3 * np.median(error):.2f} | "
+        f"{folder.name} | {len(images)} | {len(error) / len(images):.0f} | {recall:.1f} | {precision} | "
+        f"{1e3 * np.median(error):.2f} | "
         + " | ".join(f"{share:.3f}" for share in shares)
         + f" | {(np.abs(gaps) > 2).sum()} of {len(gaps)}"
     )
@@ -116,7 +117,7 @@ def main() -> None:
         every, names = int(names[k + 1]), names[:k] + names[k + 2 :]
     cv2.setNumThreads(1)
     print(
-        "mission | images | soundings | recall, % | sigma, mm | error, mm | std of z | bias, mm | > 10 mm, % | ", end=""
+        "mission | images | soundings | recall, % | sigma, mm | error, mm | std of z | bias, mm | > 10 mm, %", end=" | "
     )
     print("> 30 mm, % | other arm, % | no line, % | gap over 2 sigma")
     for name in names:
