@@ -347,7 +347,7 @@ def glow(image_bgr: NDArray[np.uint8], line_uv: Array, halfwidth_px: float, patc
     # of every third patch: the median of a fifth of the image
     around = cv2.medianBlur(np.ascontiguousarray(ratio[::3, ::3]), min(width, height) // 15 | 1)
     around = cv2.resize(around, (width, height), interpolation=cv2.INTER_NEAREST)
-    patch = cv2.connectedComponents((ratio > 1.15 * around).astype(np.uint8), connectivity=8)[1]
+    patch = np.asarray(cv2.connectedComponents((ratio > 1.15 * around).astype(np.uint8), connectivity=8)[1], np.intp)
     drawn = _discs((height, width), (line_uv + 0.5) / scale - 0.5, halfwidth_px / scale[0])
     touched = np.zeros(int(patch.max()) + 1, bool)
     touched[patch[drawn]] = True
@@ -361,9 +361,9 @@ def _discs(shape: tuple[int, int], uv: Array, halfwidth_px: float) -> NDArray[np
     radius = max(1, round(halfwidth_px))
     height, width = shape
     drawn = np.zeros((height + 2 * radius, width + 2 * radius), np.uint8)
-    column, row = np.round(uv).astype(int).T + radius
+    column, row = (part + radius for part in np.round(uv).astype(np.intp).T)
     inside = (column >= 0) & (column < drawn.shape[1]) & (row >= 0) & (row < drawn.shape[0])
     drawn[row[inside], column[inside]] = 1
     disc = np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8)
     cv2.circle(disc, (radius, radius), radius, 1, cv2.FILLED)
-    return cv2.dilate(drawn, disc)[radius:-radius, radius:-radius].astype(bool)
+    return np.asarray(cv2.dilate(drawn, disc), bool)[radius:-radius, radius:-radius]

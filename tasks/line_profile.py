@@ -32,6 +32,8 @@ _VAGUE: Final = 0.5
 _BRIGHT: Final = 3.0
 # Nor, near an end of the line, one that has less than this share of its neighbours' brightness.
 _FADING: Final = 0.5
+# What the light of the other side of a step adds to sigma there, widths.
+_EDGE: Final = 0.19
 # Nor one whose profile is so much less like a line than those around it.
 _MISFIT: Final = 4.0
 # The same in grey images, of the usual misfit and brightness along an arm; and the share of such rows, of so many
@@ -283,7 +285,10 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
     share = found.height / running_median(found.height)
     strange = (share > _BRIGHT) | (found.misfit > _MISFIT)
-    strange |= (share < _FADING) & unclipped[half] & _near_end(rows, np.where(strange, np.nan, u), width)
+    to_end = _rows_to_end(rows, np.where(strange, np.nan, u), width)
+    # light that a line leaves within a width of its end is half a line
+    strange |= (share < _FADING) & unclipped[half] & (to_end <= width)
+    sigma = np.hypot(sigma, _EDGE * width * np.exp(-0.5 * to_end / width))
     if image.ndim == 2:
         usual = running_median(found.width, max(len(found.width) // 3, 33), 64)
         strange |= _unlike_the_rest(found, gaussian_fit.misfit(light, mask * unclipped, found, usual, floor))
@@ -324,16 +329,16 @@ def _short(v: Indices, fit: _Fit) -> NDArray[np.bool_]:
     return short
 
 
-def _near_end(rows: _Rows, u: Array, width: Array) -> NDArray[np.bool_]:
-    """Which points (N,) are within a width of where the line ends or jumps: light that it leaves there is half a line.
+def _rows_to_end(rows: _Rows, u: Array, width: Array) -> Indices:
+    """How many rows (N,) each point is from where the line ends or jumps.
 
     u : (N,) columns measured, NaN where none was.
     """
     broken = ~(np.abs(np.diff(u)) < 3 * width[1:]) | (np.diff(rows.v) != 1)
-    edge = np.concatenate([[True], broken, [True]])
-    reach = 2 * int(np.ceil(median(width))) + 1
-    near = cv2.dilate(edge.astype(np.uint8)[None], np.ones((1, reach), np.uint8))[0]
-    return (near[1:] | near[:-1]).astype(bool)
+    edge = np.flatnonzero(np.concatenate([[True], broken, [True]]))
+    point = np.arange(len(u))
+    after = np.searchsorted(edge, point, side="right")
+    return np.minimum(point - edge[after - 1], edge[after] - 1 - point)
 
 
 def _all(pixels: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:
