@@ -1,5 +1,6 @@
 """What tells the laser's light from that of the bottom: its colour, in linear light."""
 
+from functools import lru_cache
 from typing import Final
 
 import cv2
@@ -27,6 +28,7 @@ _OTHER: Final = np.array([[0.5, 0, 0.5]], np.float32)
 _SAMPLES, _GROUND_ROWS = 350, 9
 
 
+@lru_cache(maxsize=4)
 def linear_light(gamma: float) -> Floats:
     """Linear light (256,), 0..1, of the levels of an image."""
     return ((np.arange(256) / 255) ** gamma).astype(np.float32)
@@ -36,7 +38,8 @@ def without_grey_channels(image: NDArray[np.uint8], gamma: float) -> NDArray[np.
     """An image (H, W[, 3]) with one channel (H, W) if all are the same: a grey image in colour."""
     if image.ndim == 2:
         return image
-    blue, green, red = linear_light(gamma)[image[::40, ::8].reshape(-1, 3).T]
+    some = image[:: max(1, image.shape[0] // 40), :: max(1, image.shape[1] // 200)]
+    blue, green, red = linear_light(gamma)[some.reshape(-1, 3).T]
     differ = np.abs(blue - green).mean() + np.abs(red - green).mean()
     if 1.5 * differ <= _GREY * (blue.mean() + green.mean() + red.mean()):
         return np.asarray(cv2.extractChannel(image, 1), np.uint8)
