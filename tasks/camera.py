@@ -91,8 +91,9 @@ def rays(camera: Camera, uv: Array) -> Rays:
     outer face of the window.
     """
     slopes = _undistort(camera, uv)
-    direction = np.column_stack([slopes, np.ones(len(slopes))])
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = np.empty((len(slopes), 3))
+    direction[:, 2] = 1 / np.sqrt(1 + slopes[:, 0] ** 2 + slopes[:, 1] ** 2)
+    direction[:, :2] = slopes * direction[:, 2:]
     if camera.port is None:
         return Rays(np.zeros_like(direction), direction)
     return _through_port(camera.port, slopes, direction)

@@ -86,7 +86,11 @@ def _upright(light: NDArray, columns: int) -> Floats:
     upright = np.asarray(cv2.transpose(light), np.float32)
     if columns == 1:
         return upright
-    return upright.reshape(-1, columns, len(light)).mean(axis=1)
+    part = upright.reshape(-1, columns, len(light))
+    total = part[:, 0] + part[:, 1]
+    for k in range(2, columns):
+        total += part[:, k]
+    return total / np.float32(columns)
 
 
 def laser_light(shine: Floats, ground_px: float, columns: int) -> Floats:

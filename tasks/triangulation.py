@@ -186,9 +186,8 @@ def _sound_sheets(
     line = line_profile.measure(image, arms, small.factor, parameters.gamma)
     if len(line.uv) < parameters.min_soundings:
         return nothing("no laser found")
-    line = line.take(_apart(camera, light, line))
     soundings = triangulate(camera, light, line.uv, line.arm, line.sigma_px)
-    keep = reject_outliers(soundings, parameters)
+    keep = _apart(camera, light, line) & reject_outliers(soundings, parameters)
     if keep.sum() < parameters.min_soundings:
         return nothing(_no_cross(len(keep), int(keep.sum())))
     soundings = soundings.take(keep)
