@@ -36,7 +36,11 @@ def seconds(work: Callable[[], object]) -> float:
 
 
 def speed(folder: Path) -> None:
-    """Time of 10-megapixel images over the time of decoding them: narrow and wide lines, rough bottom, night."""
+    """Time of 10-megapixel images over the time of decoding them: narrow and wide lines, rough bottom, night.
+
+    Detection, segmentation and triangulation, and in brackets with where the light is to be erased and the check of
+    the calibration, which `sound` does, too.
+    """
     print("scene | line, px | JPEG, MB | decode, ms | laser, ms | ratio, median | ratio, 90 % | soundings")
     for name, width_px, terrain in SCENES:
         mission = simulate(
@@ -61,12 +65,14 @@ def speed(folder: Path) -> None:
             # in turn, so that both see the same neighbours on the machine
             for _ in range(REPEATS):
                 decode = seconds(lambda c=content: cv2.imdecode(c, cv2.IMREAD_COLOR))
+                laser = seconds(lambda b=bgr, c=camera, x=light: triangulation.on_both_sheets(b, c, x, PARAMETERS))
                 sound = seconds(lambda b=bgr, c=camera, x=light: triangulation.sound(b, c, x, PARAMETERS))
-                times.append((decode, sound))
-        both = np.array(times)
-        decode, sound = 1e3 * np.median(both, axis=0)
-        median, high = np.quantile(both[:, 1] / both[:, 0], [0.5, 0.9])
-        line = f"{name} | {width_px} | {size / IMAGES:.1f} | {decode:.1f} | {sound:.1f} | {median:.2f} | {high:.2f}"
+                times.append((decode, laser, sound))
+        decode, laser, sound = np.array(times).T
+        cost = f"{1e3 * np.median(decode):.1f} | {1e3 * np.median(laser):.1f} ({1e3 * np.median(sound):.1f})"
+        ratio = f"{np.median(laser / decode):.2f} ({np.median(sound / decode):.2f})"
+        high = f"{np.quantile(laser / decode, 0.9):.2f}"
+        line = f"{name} | {width_px} | {size / IMAGES:.1f} | {cost} | {ratio} | {high}"
         print(f"{line} | {count / IMAGES:.0f}", flush=True)
 
 

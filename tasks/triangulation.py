@@ -10,6 +10,7 @@ from ..schemas.parameters import LaserParameters
 from . import cross, laser, line_profile, sheet_search
 from .camera import normalised, project, rays
 from .laser_colour import without_grey_channels
+from .medians import median
 from .sheet_grid import on_sheets
 
 Array = NDArray[np.float64]
@@ -177,23 +178,49 @@ def sound(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters
     return _sound_sheets(image_bgr, camera, light, parameters)
 
 
-def _sound_sheets(
-    image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters
-) -> ImageSoundings:
+class Sounded(NamedTuple):
+    """What `on_both_sheets` finds.
+
+    Attributes
+    ----------
+    soundings : the accepted ones.
+    line : all points that were measured.
+    small : the reduced image in which the arms were found.
+    reason : empty, or why there are no soundings.
+    """
+
+    soundings: Soundings
+    line: line_profile.Line
+    small: sheet_search.Reduced
+    reason: str
+
+
+def on_both_sheets(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters) -> Sounded:
+    """Detection, segmentation and triangulation by both sheets at once, of an image of the camera's size."""
     image = without_grey_channels(image_bgr, parameters.gamma)
     small = sheet_search.reduce(image)
     arms = sheet_search.search(small, camera, light, parameters)
     line = line_profile.measure(image, arms, small.factor, parameters.gamma)
     if len(line.uv) < parameters.min_soundings:
-        return nothing("no laser found")
+        return Sounded(no_soundings(), line, small, "no laser found")
     soundings = triangulate(camera, light, line.uv, line.arm, line.sigma_px)
     keep = _apart(camera, light, line) & reject_outliers(soundings, parameters)
-    if keep.sum() < parameters.min_soundings:
-        return nothing(_no_cross(len(keep), int(keep.sum())))
-    soundings = soundings.take(keep)
+    count = np.count_nonzero(keep)
+    if count < parameters.min_soundings:
+        return Sounded(no_soundings(), line, small, _no_cross(len(keep), count))
+    return Sounded(soundings.take(keep), line, small, "")
+
+
+def _sound_sheets(
+    image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters
+) -> ImageSoundings:
+    """`on_both_sheets`, and what else is to be known of the light: where it is to be erased, and whether arms agree."""
+    soundings, line, small, reason = on_both_sheets(image_bgr, camera, light, parameters)
+    if reason:
+        return nothing(reason)
     every = slice(None, None, small.row_step)
-    whole = cross.whole_line(line.uv[every], line.arm[every], small.row_step, image.shape[:2])
-    reach = _REACH_SIGMAS * float(np.median(line.width_px))
+    whole = cross.whole_line(line.uv[every], line.arm[every], small.row_step, image_bgr.shape[:2])
+    reach = _REACH_SIGMAS * median(line.width_px)
     first, pitch = small.origin_uv, small.pitch_uv
     patch = (3.0, 3.0 * small.factor / small.row_step)
     glow = laser.glow(small.image, (whole - first) / pitch, reach / small.factor, patch) * pitch + first
