@@ -205,7 +205,7 @@ def on_both_sheets(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, p
         return Sounded(no_soundings(), line, small, "no laser found")
     soundings = triangulate(camera, light, line.uv, line.arm, line.sigma_px)
     keep = _apart(camera, light, line) & reject_outliers(soundings, parameters)
-    count = np.count_nonzero(keep)
+    count = int(np.count_nonzero(keep))
     if count < parameters.min_soundings:
         return Sounded(no_soundings(), line, small, _no_cross(len(keep), count))
     return Sounded(soundings.take(keep), line, small, "")
