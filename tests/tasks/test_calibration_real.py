@@ -68,8 +68,8 @@ def test_lsu():
     """The published planes are not those of these photographs, but they are the same fan, moved as a whole.
 
     They entered their project four days before the photographs did, with another board. They miss the light in the
-    photographs by 23 px, where ours fit to a third of a pixel; one rigid motion, six numbers for sixty, brings all 15 to
-    within 0.1 degrees, 0.4 % of range and half a pixel.
+    photographs by 23 px, where ours fit to a third of a pixel; one rigid motion, six numbers for forty-five, brings all
+    15 to within 0.1 degrees, 0.4 % of range and half a pixel.
     """
     data, _, size = observed("lsu/image*.png", targets.Board("chessboard", 9, 6, 0.02909), 15, 0.35)
     camera = Camera(model="brown", width=size[0], height=size[1], fx=1407.86, fy=1407.12, cx=1083.25, cy=623.67)
@@ -119,7 +119,7 @@ def moved_onto(planes, X, sheet):
 
 
 def off_the_light(camera, uv, boards, sheets):
-    """How far (N,) along its row light seen at uv (N, 2) is from where a sheet (N, 4) meets its board (N, 4), pixels."""
+    """Pixels (N,) along the row from where sheets (N, 4) meet boards (N, 4) to light seen at uv (N, 2)."""
 
     def gap(shift):
         X = cast_rays(*rays(camera, uv + [shift, 0.0]), boards)
