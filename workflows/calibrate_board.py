@@ -16,7 +16,7 @@ from ..tasks import calibration_board as adjusting
 from ..tasks import calibration_board_start as starting
 from ..tasks import calibration_targets as targets
 from ..tasks.board_shape import heights
-from ..tasks.calibration_lines import cross_on_flat
+from ..tasks.calibration_lines import averaged, cross_on_flat
 from ..tasks.calibration_sheets import as_plane, basis, block, sheet_names, step_jacobian
 from . import calibrate
 from . import calibration_report as report
@@ -166,7 +166,7 @@ def _light(bgr: NDArray[np.uint8], corner_uv: Array, setup: BoardSetup, paramete
 
 
 def _data(seen: _Seen) -> adjusting.BoardData:
-    light = [starting.averaged(*one) for one in seen.light]
+    light = [averaged(*one) for one in seen.light]
     number = np.arange(len(seen.names))
     return adjusting.BoardData(
         np.concatenate([uv for _, uv in seen.corners]),

@@ -13,6 +13,7 @@ from seamosaic.schemas.parameters import LaserParameters
 from seamosaic.tasks import calibration_board as board
 from seamosaic.tasks import calibration_board_start as start
 from seamosaic.tasks import calibration_targets as targets
+from seamosaic.tasks.calibration_lines import averaged
 from seamosaic.tasks.calibration_sheets import angle_deg, cast_rays
 from seamosaic.tasks.camera import rays
 
@@ -34,7 +35,7 @@ def observed(pattern: str, target: targets.Board, lines: int, grow: float):
         corners.append(found)
         light.append(targets.parallel_lines(image, targets.outline(found[1], grow), lines, LaserParameters()))
         size = (image.shape[1], image.shape[0])
-    parts = [start.averaged(*one) for one in light]
+    parts = [averaged(*one) for one in light]
     number = np.arange(len(corners))
     data = board.BoardData(
         np.concatenate([uv for _, uv in corners]),
