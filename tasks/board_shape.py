@@ -11,14 +11,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Bends along both sides and across, and finer waves; no offset or tilt, since these belong to the pose.
-_HIGHEST: Final = 5
-_POWERS: Final = tuple((n - j, j) for n in range(2, _HIGHEST + 1) for j in range(n + 1))
+# Bends and S-bends along both sides and across; no offset or tilt, since these belong to the pose.
+_POWERS: Final = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 TERMS: Final = len(_POWERS)
-_STEPS: Final = 4
-# How large each term may be beside a plain bend, so that all bend a plate with the same energy: that of x^n over
-# -1 to 1 grows as n (n - 1) / sqrt(2 n - 3). Without it the surface would swing freely where nothing was seen.
-SUPPLE: Final = np.array([2 * np.sqrt(2 * (i + j) - 3) / ((i + j) * (i + j - 1)) for i, j in _POWERS])
+_STEPS: Final = 6
 
 
 class Shape(NamedTuple):
@@ -27,7 +23,7 @@ class Shape(NamedTuple):
     Attributes
     ----------
     centre : (2,) of x and y, metres. size_m : by which x and y are divided.
-    terms : (18,) metres, of x2, xy, y2, x3, x2y and so on to y5; empty for a flat board.
+    terms : (7,) metres, of x2, xy, y2, x3, x2y, xy2, y3; empty for a flat board.
     """
 
     centre: Array
@@ -49,9 +45,7 @@ def heights(shape: Shape, xy: Array) -> Array:
     if not len(shape.terms):
         return np.zeros(len(xy))
     x, y = (np.asarray(xy, float) - shape.centre).T / shape.size_m
-    of_x, of_y = (np.vander(value, _HIGHEST + 1, increasing=True) for value in (x, y))
-    first, second = np.array(_POWERS).T
-    return (of_x[:, first] * of_y[:, second]) @ shape.terms
+    return np.stack([x**i * y**j for i, j in _POWERS], axis=1) @ shape.terms
 
 
 def meet(shape: Shape, origin: Array, direction: Array) -> Array:

@@ -12,7 +12,7 @@ from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from ..schemas.calibration import Camera
-from .board_shape import FLAT, SUPPLE, Shape, around, heights, meet
+from .board_shape import FLAT, Shape, around, heights, meet
 from .calibration_board_start import DISTORTION, first_poses, first_sheet
 from .calibration_sheets import SheetBasis, cast_rays, moved
 from .calibration_solve import Layout, Solved, solve, unit_sigma
@@ -215,7 +215,7 @@ def _seen(data: BoardData, poses: Array, light: Array) -> Array:
 def _layout(p: _Problem) -> Layout:
     scale = [_SCALE.get(name, 0.05) * (1.0 if name in p.free else _HELD) for name in p.names]
     sheet = [0.01, 0.01, 0.005] * len(p.starts)
-    bend = _BEND * p.shape.size_m * SUPPLE[: len(p.shape.terms)]
+    bend = [_BEND * p.shape.size_m] * len(p.shape.terms)
     image = np.tile([0.01, 0.01, 0.01, 0.005, 0.005, 0.005], p.data.images)
     return Layout(len(scale) + len(sheet) + len(bend), p.data.images, 6, np.concatenate([scale, sheet, bend, image]))
 

@@ -75,15 +75,10 @@ def test_left_out_images_tell_a_wrong_light():
     assert after > 3 * before
 
 
-def padded(terms):
-    """Terms of a shape, those that are not given zero."""
-    return np.pad(np.asarray(terms, float), (0, board_shape.TERMS - len(terms)))
-
-
 def bent_scene(true, bow_m, count=9):
     """As `seen`, on a board bowed like a shallow trough; the light from exact rays onto the bowed board."""
     data, (R, t) = seen(true, count, corner_px=0.03), board_poses(count)
-    shape = board_shape.Shape(np.zeros(2), 0.3, padded([bow_m, 0, 0, 0, 0, 0.5 * bow_m]))
+    shape = board_shape.Shape(np.zeros(2), 0.3, np.array([bow_m, 0, 0, 0, 0, 0.5 * bow_m, 0]))
     on_board = data.corner_board + np.outer(board_shape.heights(shape, data.corner_board[:, :2]), [0, 0, 1])
     X = np.einsum("pij,pj->pi", R[data.corner_image], on_board) + t[data.corner_image]
     rng, parts = np.random.default_rng(3), []
@@ -130,7 +125,7 @@ def test_a_flat_board_stays_flat():
 
 
 def test_rays_meet_a_bent_board():
-    shape = board_shape.Shape(np.array([0.1, 0.0]), 0.2, 0.001 * padded(np.arange(1, 8)))
+    shape = board_shape.Shape(np.array([0.1, 0.0]), 0.2, 0.001 * np.arange(1, 8))
     rng = np.random.default_rng(0)
     on_board = rng.uniform(-0.2, 0.2, (50, 2))
     X = np.column_stack([on_board, board_shape.heights(shape, on_board)])
