@@ -124,7 +124,7 @@ class GridParameters(Model):
     ] = "auto"
     max_sigma_m: Annotated[
         Annotated[float, Field(gt=0)] | Literal["auto"],
-        Field(description="interpolated cells less certain than this stay empty, metres, 1-sigma; auto: range / 75"),
+        Field(description="less certain interpolated cells stay empty, metres, 1-sigma; auto: range / 75 or less"),
     ] = "auto"
     tile_cells: Annotated[int, Field(ge=64, le=8192)] = 512
 

@@ -17,9 +17,10 @@ from .session import Session, compute
 from .solve import Solution
 
 _LIGHTING_IMAGES = 200
-_GROWTH_TILES = 6
+_GROWTH_CELLS = 6 * 512 * 512
 _RELIEF_SHARE = 0.3
 _WORST_SIGMA = 1 / 75  # of the range: what interpolation knows less of it does not know
+_LEAST_SEEN = 0.91  # of the ground that images see: where that is mapped, what is less certain stays empty
 _PAIRS_A_BATCH = 8
 _AGREEMENT_PAIRS = 60
 
@@ -41,7 +42,8 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     mosaic_cell = grids.mosaic_cell_m(gsd) if p.mosaic.cell_m == "auto" else float(p.mosaic.cell_m)
     reach = max(1.0, typical / 3) if p.grid.max_interpolation_m == "auto" else float(p.grid.max_interpolation_m)
     worst = typical * _WORST_SIGMA if p.grid.max_sigma_m == "auto" else float(p.grid.max_sigma_m)
-    m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst)
+    enough = _LEAST_SEEN if p.grid.max_sigma_m == "auto" else 1.0
+    m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst, enough)
     outlines = _outlines(state, posed.solution, ranges)
     # what is costly does not change with the bathymetry's cell: matching is kept as fine as either of the cells, and
     # mosaics lie on a surface of their own
@@ -186,33 +188,40 @@ def _surface(
     for step in steps:
         state.ledger.begin(step)
     tiles = list(grids.tiles(grid, size))
-    cell_tasks = []
-    for k, tile in enumerate(tiles):
-        touching = _touching(outlines, images, tile, margin)
-        described = Tile(tile, touching, _of_images(linked, touching))
-        name = f"cells-{m.cell_m:g}-{k}"
-        cell_tasks.append(delayed(maps.cells_tile)(m, described, agreed, dask_key_name=name))
+    touching = [_touching(outlines, images, tile, margin) for tile in tiles]
+    cell_tasks = [
+        delayed(maps.cells_tile)(
+            m, Tile(tile, seen, _of_images(linked, seen)), agreed, dask_key_name=f"cells-{m.cell_m:g}-{k}"
+        )
+        for k, (tile, seen) in enumerate(zip(tiles, touching, strict=True))
+    ]
     cells: list[Done] = compute(state, maps.CELLS, cell_tasks)
     if not any(done.info["sounded"] for done in cells):
         raise NothingToMap(
             "no image gave a laser sounding, and no two images could be linked (without navigation only the laser "
             "gives links their scale): there is nothing to map"
         )
-    order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:_GROWTH_TILES]
-    sampled = [(tiles[k], cells[k]) for k in sorted(order)]
-    task = delayed(maps.fit_growth)(m, sampled, dask_key_name=f"growth-{m.cell_m:g}")
-    (growth,) = compute(state, maps.GROWTH, [task])
     halo = maps.surface.halo_cells(m.max_interpolation_m, m.cell_m)
-    surface_tasks = []
-    for k, tile in enumerate(tiles):
-        around = grids.pad(tile, halo)
-        near = [(t, done) for t, done in zip(tiles, cells, strict=True) if grids.intersection(around, t)]
-        name = f"surface-{m.cell_m:g}-{k}"
-        surface_tasks.append(delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=name))
+    around = [_around(tile, halo, tiles, cells) for tile in tiles]
+    count = max(1, _GROWTH_CELLS // (size * size))
+    order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:count]
+    samples = [maps.Sample(tiles[k], around[k], outlines[[image.row for image in touching[k]]]) for k in sorted(order)]
+    task = delayed(maps.fit_growth)(m, samples, dask_key_name=f"growth-{m.cell_m:g}")
+    (growth,) = compute(state, maps.GROWTH, [task])
+    surface_tasks = [
+        delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=f"surface-{m.cell_m:g}-{k}")
+        for k, (tile, near) in enumerate(zip(tiles, around, strict=True))
+    ]
     surfaces: list[Done] = compute(state, maps.SURFACE, surface_tasks)
     for step, done in zip(steps, (cells, [growth], surfaces), strict=True):
         state.ledger.end(step, done)
     return Tiles(grid, tuple(zip(tiles, surfaces, strict=True)))
+
+
+def _around(tile: Grid, halo: int, tiles: Sequence[Grid], cells: Sequence[Done]) -> list[tuple[Grid, Done]]:
+    """The tiles that a tile with its halo needs, and their cells."""
+    wide = grids.pad(tile, halo)
+    return [(other, done) for other, done in zip(tiles, cells, strict=True) if grids.intersection(wide, other)]
 
 
 def _lighting(state: Session, m: MapJob, images: Sequence[Image]) -> Done | None:
