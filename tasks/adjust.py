@@ -87,7 +87,7 @@ def adjust(
     values = _solve(graph, usable, start, p.robust_threshold)
     kept = {(link.i, link.j) for link in usable}
     poses = read_poses(values, start)
-    sigma_m, sigma_tilt = sigmas(_total(graph, usable, p.robust_threshold), values, poses, navigation)
+    sigma_m, sigma_tilt = sigmas(_marginals(_total(graph, usable, p.robust_threshold), values), poses, navigation)
     return Adjusted(
         poses=poses,
         sigma_m=sigma_m,
@@ -203,9 +203,11 @@ def _agrees(link: Link, values: Any) -> bool:
     return _distance(link.motion, between, link.motion.covariance + _LINK_FLOOR) < 6
 
 
-def sigmas(graph: Any, values: Any, poses: Poses, navigation: NavigationPrior | None) -> tuple[Array, Array]:
-    """Sigmas (n, 3) of the camera centres along the local axes and (n,) of the lean of the optical axes."""
-    marginals = _marginals(graph, values)
+def sigmas(marginals: Any, poses: Poses, navigation: NavigationPrior | None) -> tuple[Array, Array]:
+    """Sigmas (n, 3) of the camera centres along the local axes and (n,) of the lean of the optical axes.
+
+    marginals : what tells the covariance of each pose, of GTSAM's.
+    """
     count = len(poses.C_local)
     position, tilt = np.full((count, 3), np.nan), np.full(count, np.nan)
     for k in np.flatnonzero(poses.known).tolist():

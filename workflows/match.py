@@ -120,7 +120,7 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
     found, turned, free = _estimate(job, pair.prior, matched, soundings, at), (False, False), False
     if pair.prior is not None and _weak(found, matched):
         asked = None if pair.next else _STRONGEST
-        every = _matches(job, a, b, (everything[0][:asked], everything[1][:asked]))
+        every = _either_way(job, a, b, (everything[0][:asked], everything[1][:asked]))
         needed = 2 * max(len(found.inliers) if found else 0, job.parameters.match.min_inliers)
         if len(every.features) > 3 * needed:  # fewer are chance
             best, turned, free = _against_navigation(job, pair, every, needed, soundings, at)
@@ -128,7 +128,8 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
     count = len(matched.features)
     if found is None:
         return Made({}, {"model": "", "matches": count, "inliers": 0})
-    agreed = _guided(job, found, matched.features[found.inliers], a, b, at)
+    alike = _half_turned(b) if turned[0] != turned[1] else b
+    agreed = _guided(job, found, matched.features[found.inliers], a, alike, at)
     return Made(
         {
             "R": found.R_i_j,
@@ -156,6 +157,17 @@ class Matched(NamedTuple):
     uv_i: np.ndarray
     uv_j: np.ndarray
     features: np.ndarray
+
+
+def _either_way(job: Job, a: Entry, b: Entry, index: tuple[np.ndarray, ...]) -> Matched:
+    """Matches as navigation has the headings, or with one of the two images the other way round: what gives more."""
+    return max((_matches(job, a, each, index) for each in (b, _half_turned(b))), key=lambda m: len(m.features))
+
+
+def _half_turned(entry: Entry) -> Entry:
+    """The image with the descriptors that it has if it lies the other way round than navigation says."""
+    turned = features.half_turned(entry.arrays["feature_descriptors"])
+    return entry._replace(arrays={**entry.arrays, "feature_descriptors": turned})
 
 
 def _matches(job: Job, a: Entry, b: Entry, index: tuple[np.ndarray, ...]) -> Matched:
