@@ -19,7 +19,7 @@ from .camera import ground_sample_distance, normalised
 from .factors import datum, first_values, navigation_factors
 from .laser_ranges import Ranges
 from .navigation import NavigationPrior, Poses, with_half_turns
-from .reduction import Observations, State, elimination_order, linearised, observations, reduced, solve
+from .reduction import Observations, State, covariances, observations, solve
 from .tracks import Sights
 
 Array = NDArray[Any]
@@ -89,7 +89,7 @@ def adjust(
         found = refine(camera, chained.poses, sights, soundings, navigation, p)
         if found is None:
             return chained
-        sigma_m, sigma_tilt = sigmas(_marginals(found, navigation, p), found.poses, navigation)
+        sigma_m, sigma_tilt = sigmas(_covariances(found, navigation, p), found.poses, navigation)
     except (RuntimeError, IndexError):  # GTSAM: something that nothing holds, such as the scale without a laser
         return chained
     if not (sigma_m[found.poses.known] < _ANYWHERE_M).all():
@@ -144,12 +144,11 @@ def _observations(block: Block, sigma_px: float, p: AdjustParameters) -> Observa
     return observations(block.sights, block.x, sigma, block.ranges, sigma_m, 2 * p.robust_threshold)
 
 
-def _marginals(found: Bundle, navigation: NavigationPrior | None, p: AdjustParameters) -> Any:
-    """What tells the covariance of each pose."""
-    fixed, o = _fixed(found.poses, navigation), _observations(found.block, _COVARIANCE_SIGMA_PX, p)
-    graph = reduced(o, linearised(o, found.poses, found.block.X), 0.0).graph
-    graph.push_back(fixed.linearize(first_values(fixed, found.poses)))
-    return graph.eliminateMultifrontal(elimination_order(graph))
+def _covariances(found: Bundle, navigation: NavigationPrior | None, p: AdjustParameters) -> Array:
+    """Covariances (n, 6, 6) of the poses."""
+    fixed = _fixed(found.poses, navigation)
+    state = State(first_values(fixed, found.poses), found.poses, found.block.X)
+    return covariances(fixed, state, _observations(found.block, _COVARIANCE_SIGMA_PX, p))
 
 
 def _inliers(camera: Camera, poses: Poses, sights: Sights, depth: float, gate_px: float):

@@ -4,6 +4,7 @@ OpenCV's SIFT doubles an image before it looks for them, which costs three quart
 is that of the image itself, blurred a little; what a doubled image would show beyond it, seabeds hardly have.
 """
 
+import itertools
 from typing import Any, NamedTuple
 
 import cv2
@@ -84,7 +85,7 @@ def _blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
 def _of_octave(
     layers: list[NDArray[np.float32]], seen: NDArray[np.bool_], threshold: float, count: int, directed: bool
 ) -> Points:
-    difference = np.stack([b - a for a, b in zip(layers, layers[1:], strict=False)])
+    difference = np.stack([b - a for a, b in itertools.pairwise(layers)])
     k, v, u = _extrema(difference, seen, 0.8 * threshold)
     rough = np.abs(difference[k, v, u])
     keep = _strongest_everywhere(np.column_stack([u, v]), rough, seen.shape, int(_SPARE * count))

@@ -5,6 +5,7 @@ linearised and folded into the poses' normal equations by array operations; GTSA
 navigation. All increments of poses are GTSAM's: R exp(w), C + R v.
 """
 
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import gtsam
@@ -19,76 +20,95 @@ from .tracks import Sights
 Array = NDArray[Any]
 Indices = NDArray[np.intp]
 
-_FIRST_DAMPING, _MOST_DAMPING = 1e-5, 1e5
+_FIRST_DAMPING, _MOST_DAMPING, _HARDER = 1e-5, 1e10, 100.0
 _ITERATIONS = 100
+_ANCHOR = 1e2  # information of the place of one camera, 1 / m^2
 _NEAREST_M = 1e-3  # a point at the camera or behind it is taken to be here, which no solution can be
 
 
 class Observations(NamedTuple):
-    """Sights and ranges of tie points.
+    """Sights and ranges of tie points as M rows, sorted by tie point, then camera.
 
     Attributes
     ----------
-    sights : (M,) of them. x : (M, 2) slopes. sigma : of a slope.
-    ranges : (K,) of them. sigma_m : (K,).
+    image, track : (M,). is_range : (M,) bool. value : (M, 2) slopes, or the range, metres, and 0. sigma : (M,) of it.
     threshold : sigmas, of Cauchy's kernel.
-    contact : what joins a camera and a tie point; `contacts` (B,) says which of the M + K rows are of which.
-    """
-
-    sights: Sights
-    x: Array
-    sigma: float
-    ranges: Ranges
-    sigma_m: Array
-    threshold: float
-    contact: "Contacts"
-
-
-class Contacts(NamedTuple):
-    """The Q pairs of a camera and a tie point that have rows, sorted by tie point, then camera.
-
-    Attributes
-    ----------
-    image, track : (Q,). of_row : (M + K,) contact of each sight and range.
+    tracks, contacts, images : groups of rows of one tie point, of one tie point in one camera, of one camera.
+    by_image : (M,) rows, camera after camera.
     pairs : (P, 2) cameras i < j with tie points in common. first, second : contacts of the same tie point with
         either camera of a pair, all pairs one after the other. ends : (P,) where those of each end.
     """
 
     image: Indices
     track: Indices
-    of_row: Indices
+    is_range: NDArray[np.bool_]
+    value: Array
+    sigma: Array
+    threshold: float
+    tracks: "Groups"
+    contacts: "Groups"
+    images: "Groups"
+    by_image: Indices
     pairs: Indices
     first: Indices
     second: Indices
     ends: Indices
 
 
+class Groups(NamedTuple):
+    """Runs of equal numbers: the number of each run, and where it starts."""
+
+    number: Indices
+    start: Indices
+
+
 def observations(
     sights: Sights, x: Array, sigma: float, ranges: Ranges, sigma_m: Array, threshold: float
 ) -> Observations:
-    """Observations with what joins what worked out once."""
+    """Rows of sights with slopes x (M, 2) and of ranges with their sigmas (K,), and what joins what."""
     image, track = np.concatenate([sights.image, ranges.image]), np.concatenate([sights.track, ranges.track])
+    order = np.lexsort((image, track))
+    image, track = image[order], track[order]
     count = int(image.max()) + 1
-    code, of_row = np.unique(track * count + image, return_inverse=True)
-    image, track = code % count, code // count
-    found = []
+    contacts, tracks = _groups(track * count + image), _groups(track)
+    by_image = np.argsort(image, kind="stable")
+    pairs, first, second, ends = _pairs(contacts.number % count, contacts.number // count)
+    value = np.concatenate([x, np.column_stack([ranges.range_m, np.zeros(len(sigma_m))])])
+    return Observations(
+        image=image,
+        track=track,
+        is_range=order >= len(x),
+        value=value[order],
+        sigma=np.concatenate([np.full(len(x), sigma), sigma_m])[order],
+        threshold=threshold,
+        tracks=tracks,
+        contacts=contacts,
+        images=_groups(image[by_image]),
+        by_image=by_image,
+        pairs=pairs,
+        first=first,
+        second=second,
+        ends=ends,
+    )
+
+
+def _groups(numbers: Indices) -> Groups:
+    start = np.flatnonzero(np.diff(numbers, prepend=-1))
+    return Groups(numbers[start], start)
+
+
+def _pairs(image: Indices, track: Indices) -> tuple[Indices, Indices, Indices, Indices]:
+    """Pairs of cameras and their contacts, as `Observations` has them, from the camera and point of each contact."""
+    found, count = [], int(image.max()) + 1
     for step in range(1, int(np.bincount(track).max())):
         first = np.flatnonzero(track[step:] == track[:-step])
         found.append((first, first + step))
     first, second = (np.concatenate(c) for c in zip(*found, strict=True)) if found else (image[:0], image[:0])
-    pair = image[first] * count + image[second]
-    order = np.argsort(pair, kind="stable")
-    codes, starts = np.unique(pair[order], return_index=True)
-    contacts = Contacts(
-        image,
-        track,
-        of_row,
-        np.column_stack([codes // count, codes % count]),
-        first[order],
-        second[order],
-        np.append(starts[1:], len(order)),
-    )
-    return Observations(sights, x, sigma, ranges, sigma_m, threshold, contacts)
+    code = image[first] * count + image[second]
+    order = np.argsort(code, kind="stable")
+    pairs = _groups(code[order])
+    both = np.column_stack([pairs.number // count, pairs.number % count])
+    return both, first[order], second[order], np.append(pairs.start, len(order))[1:]
 
 
 class Blocks(NamedTuple):
@@ -109,66 +129,61 @@ class Blocks(NamedTuple):
 
 def error(o: Observations, poses: Poses, X: Array) -> float:
     """Half the robust sum of squares, as GTSAM counts it."""
-    left = np.concatenate([_sights_left(o, poses, X)[0], _ranges_left(o, poses, X)[0]])
-    squared = (left**2).sum(1) / o.threshold**2
-    return 0.5 * o.threshold**2 * float(np.log1p(squared).sum())
+    squared = (_left(o, _seen(o, poses, X)) ** 2).sum(1)
+    return 0.5 * o.threshold**2 * float(np.log1p(squared / o.threshold**2).sum())
 
 
-def _seen(poses: Poses, X: Array, image: Indices, track: Indices) -> Array:
-    return np.einsum("mji,mj->mi", poses.R_local_camera[image], X[track] - poses.C_local[image])
-
-
-def _sights_left(o: Observations, poses: Poses, X: Array) -> tuple[Array, Array]:
-    """What is left of the sights (M, 2), in sigmas, and the points in the cameras' frames (M, 3)."""
-    seen = _seen(poses, X, o.sights.image, o.sights.track)
+def _seen(o: Observations, poses: Poses, X: Array) -> Array:
+    """The tie points (M, 3) in the cameras' frames."""
+    off = X[o.track] - poses.C_local[o.image]
+    seen = np.einsum("mji,mj->mi", poses.R_local_camera[o.image], off)
     seen[:, 2] = np.maximum(seen[:, 2], _NEAREST_M)
-    return (seen[:, :2] / seen[:, 2:] - o.x) / o.sigma, seen
+    return seen
 
 
-def _ranges_left(o: Observations, poses: Poses, X: Array) -> tuple[Array, Array]:
-    """What is left of the ranges (K, 2), in sigmas, its second column 0, and directions in the cameras' frames."""
-    seen = _seen(poses, X, o.ranges.image, o.ranges.track)
-    distance = np.maximum(np.linalg.norm(seen, axis=1), _NEAREST_M)
-    left = (distance - o.ranges.range_m) / o.sigma_m
-    return np.column_stack([left, np.zeros(len(left))]), seen / distance[:, None]
+def _left(o: Observations, seen: Array) -> Array:
+    """What is left of the rows (M, 2), in sigmas."""
+    found = seen[:, :2] / seen[:, 2:]
+    found[o.is_range, 0], found[o.is_range, 1] = np.linalg.norm(seen[o.is_range], axis=1), 0.0
+    return (found - o.value) / o.sigma[:, None]
 
 
 def linearised(o: Observations, poses: Poses, X: Array) -> Blocks:
     """The normal equations about poses and tie points X (N, 3)."""
-    sights_left, seen = _sights_left(o, poses, X)
-    ranges_left, direction = _ranges_left(o, poses, X)
-    split = len(sights_left)
-    left = np.concatenate([sights_left, ranges_left])
-    by_seen = np.zeros((len(left), 2, 3))  # derivatives by the point in the camera's frame
-    by_seen[:split, 0, 0] = by_seen[:split, 1, 1] = 1 / (seen[:, 2] * o.sigma)
-    by_seen[:split, :, 2] = -seen[:, :2] / (seen[:, 2:] ** 2 * o.sigma)
-    by_seen[split:, 0] = direction / o.sigma_m[:, None]
+    seen = _seen(o, poses, X)
+    left = _left(o, seen)
     weight = 1 / np.sqrt(1 + (left**2).sum(1) / o.threshold**2)
-    by_seen *= weight[:, None, None]
-    left = left * weight[:, None]
-    image, track = (np.concatenate([getattr(o.sights, c), getattr(o.ranges, c)]) for c in ("image", "track"))
-    at = np.concatenate([seen, direction])  # turning the camera does not change a range
-    by_pose = np.empty((len(left), 2, 6))
-    by_pose[..., :3] = np.cross(by_seen, at[:, None, :])
-    by_pose[..., 3:] = -by_seen
-    by_point = by_seen @ poses.R_local_camera[image].transpose(0, 2, 1)
-    return Blocks(
-        _summed(by_pose.transpose(0, 2, 1) @ by_pose, image, len(poses.C_local)),
-        _summed(by_point.transpose(0, 2, 1) @ by_point, track, len(X)),
-        _summed(by_pose.transpose(0, 2, 1) @ by_point, o.contact.of_row, len(o.contact.image)),
-        -_summed(np.einsum("mrk,mr->mk", by_pose, left), image, len(poses.C_local)),
-        -_summed(np.einsum("mrk,mr->mk", by_point, left), track, len(X)),
-    )
+    by_seen = _by_seen(o, seen) * (weight / o.sigma)[:, None, None]
+    left *= weight[:, None]
+    by_pose = np.concatenate([np.cross(by_seen, seen[:, None, :]), -by_seen], axis=2)
+    by_point = by_seen @ poses.R_local_camera[o.image].transpose(0, 2, 1)
+    U, g_pose = _of_poses(o, by_pose, left, len(poses.C_local))
+    V, g_point = np.zeros((len(X), 3, 3)), np.zeros((len(X), 3))
+    V[o.tracks.number] = np.add.reduceat(by_point.transpose(0, 2, 1) @ by_point, o.tracks.start)
+    g_point[o.tracks.number] = -np.add.reduceat(np.einsum("mrk,mr->mk", by_point, left), o.tracks.start)
+    W = np.add.reduceat(by_pose.transpose(0, 2, 1) @ by_point, o.contacts.start)
+    return Blocks(U, V, W, g_pose, g_point)
 
 
-def _summed(values: Array, group: Indices, count: int) -> Array:
-    """Sums of values (M, ...) by their group."""
-    order = np.argsort(group, kind="stable")
-    present, starts = np.unique(group[order], return_index=True)
-    found = np.zeros((count, *values.shape[1:]))
-    if len(order):
-        found[present] = np.add.reduceat(values[order], starts)
+def _by_seen(o: Observations, seen: Array) -> Array:
+    """Derivatives (M, 2, 3) of the values by the point in the camera's frame."""
+    found = np.zeros((len(seen), 2, 3))
+    found[:, 0, 0] = found[:, 1, 1] = 1 / seen[:, 2]
+    found[:, :, 2] = -seen[:, :2] / seen[:, 2:] ** 2
+    found[o.is_range] = 0.0
+    found[o.is_range, 0] = seen[o.is_range] / np.linalg.norm(seen[o.is_range], axis=1, keepdims=True)
     return found
+
+
+def _of_poses(o: Observations, by_pose: Array, left: Array, count: int) -> tuple[Array, Array]:
+    """Blocks (n, 6, 6) and right-hand sides (n, 6) of the poses."""
+    U, g = np.zeros((count, 6, 6)), np.zeros((count, 6))
+    ends = np.append(o.images.start, len(o.by_image))[1:]
+    for k, start, end in zip(o.images.number.tolist(), o.images.start.tolist(), ends.tolist(), strict=True):
+        rows = o.by_image[start:end]
+        A = by_pose[rows].reshape(-1, 6)
+        U[k], g[k] = A.T @ A, -A.T @ left[rows].ravel()
+    return U, g
 
 
 class Reduced(NamedTuple):
@@ -180,23 +195,23 @@ class Reduced(NamedTuple):
 
 
 def reduced(o: Observations, blocks: Blocks, damping: float) -> Reduced:
-    """Tie points eliminated; all diagonals grow by a share `damping` first (Levenberg & Marquardt)."""
-    contact = o.contact
+    """Tie points eliminated; all diagonals grow by `damping` first (Levenberg)."""
+    image, track = o.image[o.contacts.start], o.track[o.contacts.start]
     U, V = (_damped(values, damping) for values in (blocks.U, blocks.V))
     V_inverse = np.linalg.inv(V)
     K = np.linalg.cholesky((V_inverse + V_inverse.transpose(0, 2, 1)) / 2)
-    Y = (blocks.W @ K[contact.track]).transpose(0, 2, 1).copy()  # (Q, 3, 6): V^-1 = K K'
-    diagonal = U - _summed(Y.transpose(0, 2, 1) @ Y, contact.image, len(U))
-    right = np.einsum("qab,qb->qa", blocks.W, np.einsum("nab,nb->na", V_inverse, blocks.g_point)[contact.track])
-    g = blocks.g_pose - _summed(right, contact.image, len(U))
-    graph = gtsam.GaussianFactorGraph()
-    for k in np.flatnonzero(np.einsum("nii->n", blocks.U) > 0).tolist():
-        graph.add(gtsam.HessianFactor(k, diagonal[k], g[k], 0.0))
+    Y = np.ascontiguousarray((blocks.W @ K[track]).transpose(0, 2, 1))  # (Q, 3, 6): V^-1 = K K'
+    right = np.einsum("nji,nj->ni", K, blocks.g_point)[track]
+    graph, order = gtsam.GaussianFactorGraph(), np.argsort(image, kind="stable")
+    own = _groups(image[order])
+    ends = np.append(own.start, len(order))[1:]
+    for k, start, end in zip(own.number.tolist(), own.start.tolist(), ends.tolist(), strict=True):
+        A, b = Y[order[start:end]].reshape(-1, 6), right[order[start:end]].ravel()
+        graph.add(gtsam.HessianFactor(k, U[k] - A.T @ A, blocks.g_pose[k] - A.T @ b, 0.0))
     start, nothing, zero = 0, np.zeros((6, 6)), np.zeros(6)
-    for (i, j), end in zip(contact.pairs.tolist(), contact.ends.tolist(), strict=True):
-        first, second = Y[contact.first[start:end]], Y[contact.second[start:end]]
-        across = -first.reshape(-1, 6).T @ second.reshape(-1, 6)
-        graph.add(gtsam.HessianFactor(i, j, nothing, across, zero, nothing, zero, 0.0))
+    for (i, j), end in zip(o.pairs.tolist(), o.ends.tolist(), strict=True):
+        first, second = (Y[side[start:end]].reshape(-1, 6) for side in (o.first, o.second))
+        graph.add(gtsam.HessianFactor(i, j, nothing, -first.T @ second, zero, nothing, zero, 0.0))
         start = end
     return Reduced(graph, V_inverse, blocks)
 
@@ -204,14 +219,16 @@ def reduced(o: Observations, blocks: Blocks, damping: float) -> Reduced:
 def _damped(values: Array, damping: float) -> Array:
     found = values.copy()
     at = np.arange(values.shape[1])
-    found[:, at, at] *= 1 + damping
+    found[:, at, at] += damping
     return found
 
 
 def moved(o: Observations, made: Reduced, X: Array, step: Array) -> Array:
     """The tie points X (N, 3) after the poses made their step (n, 6)."""
-    pulled = np.einsum("qab,qa->qb", made.blocks.W, step[o.contact.image])
-    right = made.blocks.g_point - _summed(pulled, o.contact.track, len(X))
+    right = made.blocks.g_point.copy()
+    pulled = np.einsum("qab,qa->qb", made.blocks.W, step[o.image[o.contacts.start]])
+    starts = np.searchsorted(o.contacts.start, o.tracks.start)
+    right[o.tracks.number] -= np.add.reduceat(pulled, starts)
     return X + np.einsum("nab,nb->na", made.V_inverse, right)
 
 
@@ -226,7 +243,8 @@ class State(NamedTuple):
 def solve(fixed: Any, start: State, o: Observations, tolerance: float) -> State:
     """The state in which the error of some factors of poses and of the observations is least.
 
-    Levenberg & Marquardt.
+    Levenberg's way: damping is the same in all directions, for a share of the diagonal, which the tie points make
+    large, would keep the map from moving as a whole.
 
     Parameters
     ----------
@@ -241,27 +259,67 @@ def solve(fixed: Any, start: State, o: Observations, tolerance: float) -> State:
     before = fixed.error(state.values) + error(o, state.poses, state.X)
     for _ in range(_ITERATIONS):
         blocks, held = linearised(o, state.poses, state.X), fixed.linearize(state.values)
-        after = np.inf
-        while damping < _MOST_DAMPING:
+        trial, after = state, np.inf
+        while not after <= before:
+            if damping > _MOST_DAMPING:
+                return state
             made = reduced(o, blocks, damping)
             made.graph.push_back(held)
-            ordering = ordering or elimination_order(made.graph)
-            trial = _stepped(o, state, made, made.graph.optimize(ordering))
-            after = fixed.error(trial.values) + error(o, trial.poses, trial.X)
-            if after <= before:
-                break
-            damping *= 10
-        if not after <= before:
-            return state
-        gain, before, state, damping = before - after, after, trial, damping / 10
+            made.graph.add(_anchor(o, _ANCHOR))
+            ordering = ordering or _elimination_order(made.graph)
+            with suppress(RuntimeError):  # too weakly held for Cholesky's way: damping helps
+                trial = _stepped(o, state, made, made.graph.optimize(ordering))
+                after = fixed.error(trial.values) + error(o, trial.poses, trial.X)
+            damping *= 1 if after <= before else _HARDER
+        gain, before, state, damping = before - after, after, trial, damping / _HARDER
         if gain <= tolerance * before:
             return state
     return state
 
 
-def elimination_order(graph: Any) -> Any:
+def _elimination_order(graph: Any) -> Any:
     """By nested dissection, which a survey's wide and flat net of images asks for."""
     return gtsam.Ordering.MetisGaussianFactorGraph(graph)
+
+
+def _anchor(o: Observations, information: float, right: Array | None = None) -> Any:
+    """A factor that holds one camera where it is, or pushes it by `right` (6,)."""
+    k = int(o.images.number[len(o.images.number) // 2])
+    weight = np.diag([0.0, 0.0, 0.0, *[information] * 3])
+    return gtsam.HessianFactor(k, weight, np.zeros(6) if right is None else right, 0.0)
+
+
+def covariances(fixed: Any, state: State, o: Observations) -> Array:
+    """Covariances (n, 6, 6) of the poses; NaN of those that have none.
+
+    That a map may move as a whole by decimetres, but its parts by tenths of millimetres, is too much for GTSAM's
+    Cholesky factors, and its QR needs several times the memory. So one camera is held as if it were known to
+    centimetres, and what that takes off the covariances is given back (matrix inversion lemma).
+
+    Raises
+    ------
+    RuntimeError
+        There is something that nothing holds.
+    """
+    graph = reduced(o, linearised(o, state.poses, state.X), 0.0).graph
+    graph.push_back(fixed.linearize(state.values))
+    order = _elimination_order(graph)
+    graph.add(_anchor(o, _ANCHOR))
+    tree = graph.eliminateMultifrontal(order)
+    middle = tree.optimize()
+    known = [k for k in np.flatnonzero(state.poses.known).tolist() if middle.exists(k)]
+    found = np.full((len(state.poses.C_local), 6, 6), np.nan)
+    found[known] = [tree.marginalCovariance(k) for k in known]
+    across = np.zeros((len(found), 6, 3))  # covariance of each pose with the place of the anchor
+    for axis in range(3):
+        pushed = gtsam.GaussianFactorGraph()
+        pushed.push_back(graph)
+        pushed.add(_anchor(o, 0.0, np.eye(6)[3 + axis]))
+        delta = pushed.optimize(order)
+        across[known, :, axis] = [delta.at(k) - middle.at(k) for k in known]
+    of_anchor = across[int(o.images.number[len(o.images.number) // 2]), 3:]
+    given_back = np.linalg.inv(np.eye(3) / _ANCHOR - (of_anchor + of_anchor.T) / 2)
+    return found + across @ given_back @ across.transpose(0, 2, 1)
 
 
 def _stepped(o: Observations, state: State, made: Reduced, delta: Any) -> State:
