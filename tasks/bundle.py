@@ -123,7 +123,8 @@ def refine(
             return None
         ranges = _believable(poses, X, laser_ranges.measure(poses, X, lit, p.max_ranges), rough)
         block = Block(sights, x, X, focal_px, ranges, rough)
-        values, poses, X = solve(fixed, State(values, poses, X), _observations(block, sigma_px, p), tolerance)
+        o, afloat = _observations(block, sigma_px, p), navigation is not None
+        values, poses, X = solve(fixed, State(values, poses, X), o, tolerance, afloat)
         residual_px = residuals(poses, sights, x, X) * focal_px
         sigma_px, rough = _noise_px(residual_px, len(X)), laser_ranges.roughness(poses, X, ranges)
         bundle = Bundle(poses, block._replace(X=X, roughness=rough), residual_px, sigma_px)

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from ..schemas.parameters import FeatureParameters
 from . import interest
 
+_SMALLEST_TILE_PX = 100.0
+
 
 class Features(NamedTuple):
     """Interest points of one image.
@@ -73,21 +75,50 @@ def half_turned(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.roll(cells, 4, axis=3).reshape(-1, 128)
 
 
-def match(descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8], ratio: float) -> NDArray[np.intp]:
-    """Mutual nearest neighbours (M, 2) that pass Lowe's ratio test, by the Hellinger distance (RootSIFT)."""
-    if len(descriptors_a) < 2 or len(descriptors_b) < 2:
+class Expected(NamedTuple):
+    """Where navigation expects the features of image a in image b: (N, 2) pixels, and how far off they may be."""
+
+    uv: NDArray[np.floating]
+    reach_px: float
+
+
+def match(a: Features, b: Features, ratio: float, expected: Expected | None = None) -> NDArray[np.intp]:
+    """Mutual nearest neighbours (M, 2) that pass Lowe's ratio test, by the Hellinger distance (RootSIFT).
+
+    expected : of features of image b that are farther off, none is asked.
+    """
+    if len(a.uv) < 2 or len(b.uv) < 2:
         return np.zeros((0, 2), np.intp)
-    a, b = unit_root(descriptors_a), unit_root(descriptors_b)
-    similarity = a @ b.T
-    rows = np.arange(len(a))
-    best = similarity.argmax(1)
-    first = similarity[rows, best]
-    similarity[rows, best] = -1
+    root_a, root_b = unit_root(a.descriptors), unit_root(b.descriptors)
+    best, first = np.zeros(len(root_a), np.intp), np.full(len(root_a), -1.0, np.float32)
+    second, of_b = first.copy(), np.full(len(root_b), -1.0, np.float32)
+    for rows, columns in _tiles(len(root_a), b.uv, expected):
+        similarity = root_a[rows] @ root_b[columns].T
+        of_b[columns] = np.maximum(of_b[columns], similarity.max(0))
+        chosen, each = similarity.argmax(1), np.arange(len(rows))
+        best[rows], first[rows] = columns[chosen], similarity[each, chosen]
+        similarity[each, chosen] = -1
+        second[rows] = similarity.max(1)
     # |a - b|^2 = 2 - 2 a.b for unit vectors
-    distinct = np.flatnonzero((1 - first) < ratio**2 * (1 - similarity.max(1)))
-    back = (b[best[distinct]] @ a.T).argmax(1)  # of the few that are left: looking down columns is slow
-    keep = distinct[back == distinct]
+    keep = np.flatnonzero((1 - first < ratio**2 * (1 - second)) & (first >= of_b[best]) & (first > 0))
     return np.column_stack([keep, best[keep]])
+
+
+def _tiles(
+    count: int, uv_b: NDArray[np.float32], expected: Expected | None
+) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Features of image a, each once, with those of image b that may match them: two at least."""
+    if expected is None:
+        return [(np.arange(count), np.arange(len(uv_b)))]
+    side = max(expected.reach_px, _SMALLEST_TILE_PX)
+    tile = np.floor(expected.uv / side).astype(int)
+    found = []
+    for place in np.unique(tile, axis=0):
+        low = place * side - expected.reach_px
+        near = (uv_b >= low).all(1) & (uv_b <= low + side + 2 * expected.reach_px).all(1)
+        if near.sum() >= 2:
+            found.append((np.flatnonzero((tile == place).all(1)), np.flatnonzero(near)))
+    return found
 
 
 def unit_root(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -22,7 +22,8 @@ Indices = NDArray[np.intp]
 
 _FIRST_DAMPING, _MOST_DAMPING, _HARDER = 1e-5, 1e10, 100.0
 _ITERATIONS = 100
-_ANCHOR = 1e2  # information of the place of one camera, 1 / m^2
+_ANCHOR = 1e5  # information of the place of one camera, 1 / m^2: 3 mm
+_NOTHING_LEFT = 1e-9  # share of the anchor's covariance: as much as to be held to 100 m
 _NEAREST_M = 1e-3  # a point at the camera or behind it is taken to be here, which no solution can be
 
 
@@ -240,7 +241,7 @@ class State(NamedTuple):
     X: Array
 
 
-def solve(fixed: Any, start: State, o: Observations, tolerance: float) -> State:
+def solve(fixed: Any, start: State, o: Observations, tolerance: float, afloat: bool) -> State:
     """The state in which the error of some factors of poses and of the observations is least.
 
     Levenberg's way: damping is the same in all directions, for a share of the diagonal, which the tie points make
@@ -249,11 +250,8 @@ def solve(fixed: Any, start: State, o: Observations, tolerance: float) -> State:
     Parameters
     ----------
     fixed : GTSAM graph of what holds poses besides. tolerance : relative decrease of the error that ends it.
-
-    Raises
-    ------
-    RuntimeError
-        There is something that nothing holds.
+    afloat : whether the map as a whole is held to decimetres only. It is left where the start has it, which nothing
+        but navigation has a say in: see `covariances`.
     """
     state, damping, ordering = start, _FIRST_DAMPING, None
     before = fixed.error(state.values) + error(o, state.poses, state.X)
@@ -265,7 +263,7 @@ def solve(fixed: Any, start: State, o: Observations, tolerance: float) -> State:
                 return state
             made = reduced(o, blocks, damping)
             made.graph.push_back(held)
-            made.graph.add(_anchor(o, _ANCHOR))
+            made.graph.add(_anchor(o, _ANCHOR if afloat else 0.0))
             ordering = ordering or _elimination_order(made.graph)
             with suppress(RuntimeError):  # too weakly held for Cholesky's way: damping helps
                 trial = _stepped(o, state, made, made.graph.optimize(ordering))
@@ -294,7 +292,7 @@ def covariances(fixed: Any, state: State, o: Observations) -> Array:
 
     That a map may move as a whole by decimetres, but its parts by tenths of millimetres, is too much for GTSAM's
     Cholesky factors, and its QR needs several times the memory. So one camera is held as if it were known to
-    centimetres, and what that takes off the covariances is given back (matrix inversion lemma).
+    millimetres, and what that takes off the covariances is given back (matrix inversion lemma).
 
     Raises
     ------
@@ -318,8 +316,10 @@ def covariances(fixed: Any, state: State, o: Observations) -> Array:
         delta = pushed.optimize(order)
         across[known, :, axis] = [delta.at(k) - middle.at(k) for k in known]
     of_anchor = across[int(o.images.number[len(o.images.number) // 2]), 3:]
-    given_back = np.linalg.inv(np.eye(3) / _ANCHOR - (of_anchor + of_anchor.T) / 2)
-    return found + across @ given_back @ across.transpose(0, 2, 1)
+    left = np.eye(3) / _ANCHOR - (of_anchor + of_anchor.T) / 2
+    if np.linalg.eigvalsh(left)[0] < _NOTHING_LEFT / _ANCHOR:
+        raise RuntimeError("nothing but the anchor holds the map")
+    return found + across @ np.linalg.inv(left) @ across.transpose(0, 2, 1)
 
 
 def _stepped(o: Observations, state: State, made: Reduced, delta: Any) -> State:

@@ -23,7 +23,7 @@ def test_features_follow_a_shift_to_a_fraction_of_a_pixel():
     image = _seabed()
     moved = cv2.warpAffine(image, np.array([[1, 0, 7.4], [0, 1, -3.2]]), image.shape[::-1])
     a, b = (features.detect(each, _none(each), P) for each in (image, moved))
-    pairs = features.match(a.descriptors, b.descriptors, 0.8)
+    pairs = features.match(a, b, 0.8)
     shift = b.uv[pairs[:, 1]] - a.uv[pairs[:, 0]]
     good = np.linalg.norm(shift - [7.4, -3.2], axis=1) < 1
     assert len(pairs) > 200
@@ -64,12 +64,12 @@ def test_an_image_without_texture_has_no_features():
     grey = np.full((300, 400), 90, np.uint8)
     found = features.detect(grey, _none(grey), P)
     assert found.descriptors.shape == (0, 128)
-    assert features.match(found.descriptors, found.descriptors, 0.8).shape == (0, 2)
+    assert features.match(found, found, 0.8).shape == (0, 2)
 
 
 def test_the_ratio_decides_how_many_matches_there_are():
     a, b = (features.detect(each, _none(each), P) for each in (_seabed(seed=1), _seabed(seed=2)))
-    strict, lax = (len(features.match(a.descriptors, b.descriptors, ratio)) for ratio in (0.7, 0.95))
+    strict, lax = (len(features.match(a, b, ratio)) for ratio in (0.7, 0.95))
     assert 3 * strict < lax
 
 
