@@ -43,13 +43,9 @@ def first_values(graph: Any, start: Poses) -> Any:
     return values
 
 
-def optimise(graph: Any, values: Any, tolerance: float = 1e-5) -> Any:
-    """The values at which a graph's error is least (Levenberg & Marquardt).
-
-    tolerance : relative decrease of the error below which the iterations end.
-    """
+def optimise(graph: Any, values: Any) -> Any:
+    """The values at which a graph's error is least (Levenberg & Marquardt)."""
     p = gtsam.LevenbergMarquardtParams()
-    p.setRelativeErrorTol(tolerance)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, p).optimize()
 
 
