@@ -60,7 +60,7 @@ class LaserParameters(Model):
 class FeatureParameters(Model):
     """SIFT features (paper III.E)."""
 
-    max_features: Annotated[int, Field(ge=100, le=50_000)] = 2500
+    max_features: Annotated[int, Field(ge=100, le=50_000)] = 4000
     max_pixels: Annotated[int, Field(ge=100_000, description="images with more pixels are scaled down to this")] = (
         700_000
     )
