@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-FIRST_SIGMA_PX = 1.1  # of the blur of the first layer of each octave
+FIRST_SIGMA_PX = 1.0  # of the blur of the first layer of each octave
 LAYERS = 2  # an octave
 _OCTAVES = 4
 _CAMERA_SIGMA_PX = 0.5  # blur that images have as they are taken

@@ -22,7 +22,7 @@ def _none(image):
 def test_features_follow_a_shift_to_a_fraction_of_a_pixel():
     image = _seabed()
     moved = cv2.warpAffine(image, np.array([[1, 0, 7.4], [0, 1, -3.2]]), image.shape[::-1])
-    a, b = (features.detect(each, _none(each), P) for each in (image, moved))
+    a, b = (features.detect(each, _none(each), P, 0.0) for each in (image, moved))
     pairs = features.match(a, b, 0.8)
     shift = b.uv[pairs[:, 1]] - a.uv[pairs[:, 0]]
     good = np.linalg.norm(shift - [7.4, -3.2], axis=1) < 1
