@@ -195,7 +195,7 @@ def _expected(job: Job, pair: PairTask, poses: Poses, a: Entry, b: Entry, range_
     of_a, of_b = _features(a), _features(b)
     uv = [pairs.expected(lens, of.uv.astype(float), poses, k, 1 - k, range_m) for k, of in enumerate((of_a, of_b))]
     seen = [np.flatnonzero(pairs.inside(lens, each, margin_px)) for each in uv]
-    part_a, part_b = (features.Features(*(v[n] for v in of)) for of, n in zip((of_a, of_b), seen, strict=True))
+    part_a, part_b = (features.Features(of.uv[n], of.descriptors[n]) for of, n in zip((of_a, of_b), seen, strict=True))
     expected = features.Expected(uv[0][seen[0]], margin_px)
     found = features.match(part_a, part_b, job.parameters.match.ratio, expected)
     return _named(a, b, np.column_stack([seen[0][found[:, 0]], seen[1][found[:, 1]]]))
