@@ -5,6 +5,7 @@ pair motions and drifting navigation, goes through the pose graph and the bundle
 made here, not detected: this is about the adjustment alone.
 """
 
+import itertools
 import resource
 import sys
 import time
@@ -103,7 +104,8 @@ def spread(off) -> float:
     return float(np.sqrt(((off - off.mean(0)) ** 2).sum(1).mean()))
 
 
-def run(count: int) -> None:
+def run(count: int) -> float:
+    """Adjust a survey of `count` images; processor seconds."""
     rng, p = np.random.default_rng(count), AdjustParameters()
     true = survey(count, rng)
     seen, prior, linked = sights(true, rng), navigation(true, rng), links(true, rng)
@@ -121,8 +123,11 @@ def run(count: int) -> None:
         f"rms {rms[0] * 1e3:.1f} mm, then {rms[1] * 1e3:.1f} mm",
         flush=True,
     )
+    return ended - began
 
 
 if __name__ == "__main__":
-    for size in [int(a) for a in sys.argv[1:]] or [1000, 10_000]:
-        run(size)
+    sizes = sorted(int(a) for a in sys.argv[1:]) or [1000, 10_000]  # the peak of memory is that of all so far
+    seconds = [run(size) for size in sizes]
+    for (n, before), (m, after) in itertools.pairwise(zip(sizes, seconds, strict=True)):
+        print(f"from {n} to {m} images time grows as n^{np.log(after / before) / np.log(m / n):.2f}")

@@ -8,7 +8,6 @@ terrain between soundings are measured on what the rounds before leave of them.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,9 +16,10 @@ from ..schemas.parameters import AdjustParameters
 from . import laser_ranges
 from .adjust import Adjusted, sigmas
 from .camera import ground_sample_distance, normalised
-from .factors import datum, first_values, navigation_factors, optimise, read_poses
+from .factors import datum, first_values, navigation_factors
 from .laser_ranges import Ranges
 from .navigation import NavigationPrior, Poses, with_half_turns
+from .reduction import Observations, State, covariances, observations, solve
 from .tracks import Sights
 
 Array = NDArray[Any]
@@ -35,7 +35,6 @@ _RANGE_GATE = 6.0  # sigmas
 # The errors of ranges beside each other are alike. Sights hold an image against that; one that has none, as laser
 # images have, would slide down the slopes of such errors, so its ranges count as if they were so many times worse.
 _BLIND = 20.0
-_RANGE_STEP = 1.1  # ratio of neighbouring sigmas that have a noise model of their own
 _MAD_TO_SIGMA = 1.4826
 
 
@@ -90,8 +89,7 @@ def adjust(
         found = refine(camera, chained.poses, sights, soundings, navigation, p)
         if found is None:
             return chained
-        graph, values = _graph(found.poses, found.block, _COVARIANCE_SIGMA_PX, navigation, p)
-        sigma_m, sigma_tilt = sigmas(graph, values, found.poses, navigation)
+        sigma_m, sigma_tilt = sigmas(_covariances(found, navigation, p), found.poses, navigation)
     except (RuntimeError, IndexError):  # GTSAM: something that nothing holds, such as the scale without a laser
         return chained
     if not (sigma_m[found.poses.known] < _ANYWHERE_M).all():
@@ -115,7 +113,8 @@ def refine(
     lit = {k: own for k, own in soundings.items() if start.known[k] and len(own)}
     depth = float(np.median([np.median(own[:, 2]) for own in lit.values()])) if lit else 3.0
     sights = sights.take(start.known[sights.image])
-    bundle, poses = None, start
+    fixed = _fixed(start, navigation)
+    bundle, poses, values = None, start, first_values(fixed, start)
     sigma_px, rough = _FIRST_SIGMA_PX, laser_ranges.FIRST_ROUGHNESS
     for gate_px, tolerance in zip(_GATES_PX, _TOLERANCES, strict=True):
         gate_px = max(gate_px, _GATE_SIGMAS * sigma_px)
@@ -123,28 +122,34 @@ def refine(
         if not len(X):
             return None
         ranges = _believable(poses, X, laser_ranges.measure(poses, X, lit, p.max_ranges), rough)
-        graph, values = _graph(poses, Block(sights, x, X, focal_px, ranges, rough), sigma_px, navigation, p)
-        values = optimise(graph, values, tolerance)
-        poses = read_poses(values, poses)
-        X = np.array([values.atPoint3(_tie_point(n)) for n in range(len(X))])
+        block = Block(sights, x, X, focal_px, ranges, rough)
+        o, afloat = _observations(block, sigma_px, p), navigation is not None
+        values, poses, X = solve(fixed, State(values, poses, X), o, tolerance, afloat)
         residual_px = residuals(poses, sights, x, X) * focal_px
         sigma_px, rough = _noise_px(residual_px, len(X)), laser_ranges.roughness(poses, X, ranges)
-        bundle = Bundle(poses, Block(sights, x, X, focal_px, ranges, rough), residual_px, sigma_px)
+        bundle = Bundle(poses, block._replace(X=X, roughness=rough), residual_px, sigma_px)
     return bundle
 
 
-def _graph(
-    poses: Poses, block: Block, sigma_px: float, navigation: NavigationPrior | None, p: AdjustParameters
-) -> tuple[Any, Any]:
-    """GTSAM's graph and the values to start from."""
-    first = int(np.flatnonzero(poses.known)[0])
-    graph = navigation_factors(navigation) if navigation else datum(poses, first)
-    values = first_values(graph, poses)
-    _add_sights(graph, values, block.sights, block.x, block.X, sigma_px / block.focal_px, p.robust_threshold)
+def _fixed(poses: Poses, navigation: NavigationPrior | None) -> Any:
+    """What holds the poses besides tie points, as a GTSAM graph."""
+    return navigation_factors(navigation) if navigation else datum(poses, int(np.flatnonzero(poses.known)[0]))
+
+
+def _observations(block: Block, sigma_px: float, p: AdjustParameters) -> Observations:
+    """Cauchy's kernel at twice the threshold of pair motions: a wrong match must not pull, however many it has."""
     sigma_m = laser_ranges.sigma(block.ranges.away_m, block.roughness)
     blind = ~np.isin(block.ranges.image, block.sights.image)
-    _add_ranges(graph, block.ranges, np.where(blind, _BLIND * sigma_m, sigma_m), p.robust_threshold)
-    return graph, values
+    sigma_m = np.where(blind, _BLIND * sigma_m, sigma_m)
+    sigma = sigma_px / block.focal_px
+    return observations(block.sights, block.x, sigma, block.ranges, sigma_m, 2 * p.robust_threshold)
+
+
+def _covariances(found: Bundle, navigation: NavigationPrior | None, p: AdjustParameters) -> Array:
+    """Covariances (n, 6, 6) of the poses."""
+    fixed = _fixed(found.poses, navigation)
+    state = State(first_values(fixed, found.poses), found.poses, found.block.X)
+    return covariances(fixed, state, _observations(found.block, _COVARIANCE_SIGMA_PX, p))
 
 
 def _inliers(camera: Camera, poses: Poses, sights: Sights, depth: float, gate_px: float):
@@ -197,34 +202,6 @@ def _believable(poses: Poses, X: Array, ranges: Ranges, rough: float) -> Ranges:
     level = np.median(left) if len(left) else 0.0  # what all have in common is the scale that they are to tell
     keep = np.abs(left - level) < _RANGE_GATE * laser_ranges.sigma(ranges.away_m, rough)
     return Ranges(*(values[keep] for values in ranges))
-
-
-def _tie_point(number: int) -> int:
-    return gtsam.symbol("x", number)
-
-
-def _robust(noise: Any, threshold: float) -> Any:
-    """Cauchy's kernel at twice the threshold of pair motions: a wrong match must not pull, however many it has."""
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(2 * threshold), noise)
-
-
-def _add_sights(graph: Any, values: Any, sights: Sights, x: Array, X: Array, sigma: float, threshold: float) -> None:
-    noise, pinhole = _robust(gtsam.noiseModel.Isotropic.Sigma(2, sigma), threshold), gtsam.Cal3_S2()
-    for number, point in enumerate(X):
-        values.insert(_tie_point(number), point)
-    for image, track, seen in zip(sights.image.tolist(), sights.track.tolist(), x, strict=True):
-        graph.add(gtsam.GenericProjectionFactorCal3_S2(seen, noise, image, _tie_point(track), pinhole))
-
-
-def _add_ranges(graph: Any, ranges: Ranges, sigma: Array, threshold: float) -> None:
-    level = np.round(np.log(sigma) / np.log(_RANGE_STEP)).astype(int)
-    noises = {
-        k: _robust(gtsam.noiseModel.Isotropic.Sigma(1, float(_RANGE_STEP**k)), threshold)
-        for k in np.unique(level).tolist()
-    }
-    columns = (ranges.image.tolist(), ranges.track.tolist(), ranges.range_m.tolist(), level.tolist())
-    for image, track, range_m, k in zip(*columns, strict=True):
-        graph.add(gtsam.RangeFactor3D(image, _tie_point(track), range_m, noises[k]))
 
 
 def _noise_px(residual_px: Array, points: int) -> float:

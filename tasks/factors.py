@@ -9,7 +9,6 @@ from typing import Any
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from .navigation import NavigationPrior, Poses, relative, walk_m
 
@@ -44,13 +43,9 @@ def first_values(graph: Any, start: Poses) -> Any:
     return values
 
 
-def optimise(graph: Any, values: Any, tolerance: float = 1e-5) -> Any:
-    """The values at which a graph's error is least (Levenberg & Marquardt).
-
-    tolerance : relative decrease of the error below which the iterations end.
-    """
+def optimise(graph: Any, values: Any) -> Any:
+    """The values at which a graph's error is least (Levenberg & Marquardt)."""
     p = gtsam.LevenbergMarquardtParams()
-    p.setRelativeErrorTol(tolerance)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, p).optimize()
 
 
@@ -107,8 +102,10 @@ def _noise(rotation: Array | float, R_local_camera: Array, horizontal_m: float, 
     """Noise of a pose: covariance (3, 3) or sigma of its rotation, sigmas of its position along the local axes."""
     R = R_local_camera
     position = R.T @ np.diag([horizontal_m, horizontal_m, vertical_m]) ** 2 @ R
-    turn = rotation if isinstance(rotation, np.ndarray) else np.eye(3) * rotation**2
-    return gaussian(np.asarray(block_diag(turn, position)))
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = rotation if isinstance(rotation, np.ndarray) else np.eye(3) * rotation**2
+    covariance[3:, 3:] = position
+    return gaussian(covariance)
 
 
 def robust(noise: Any, threshold: float) -> Any:

@@ -80,6 +80,11 @@ class NavigationPrior(NamedTuple):
     R_camera_vehicle: Array
 
 
+def north_rad(poses: Poses) -> Array:
+    """Direction (n,) of north in each image, from u towards v, radians."""
+    return np.arctan2(poses.R_local_camera[:, 1, 1], poses.R_local_camera[:, 1, 0])
+
+
 class RelativePrior(NamedTuple):
     """Navigation's motion between two images, as `motion.Motion` states it.
 
