@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from ..schemas.calibration import Camera
 from ..schemas.parameters import AdjustParameters
-from . import laser_ranges
+from . import crossovers, laser_ranges
 from .adjust import Adjusted, sigmas
 from .camera import ground_sample_distance, normalised
+from .crossovers import Crossovers, Lines
 from .factors import datum, first_values, navigation_factors, optimise, read_poses
 from .laser_ranges import Ranges
 from .navigation import NavigationPrior, Poses, with_half_turns
@@ -46,7 +47,7 @@ class Block(NamedTuple):
     ----------
     sights : of tie points, wrong matches left out. x : (M, 2) their slopes.
     X : (N, 3) tie points, local. focal_px : pixels a slope.
-    ranges : of the laser. roughness : see `laser_ranges`.
+    ranges : of the laser. roughness : see `laser_ranges`. crossed : laser lines of different images.
     """
 
     sights: Sights
@@ -55,6 +56,7 @@ class Block(NamedTuple):
     focal_px: float
     ranges: Ranges
     roughness: float
+    crossed: Crossovers
 
 
 class Bundle(NamedTuple):
@@ -77,17 +79,19 @@ def adjust(
     chained: Adjusted,
     sights: Sights,
     soundings: Mapping[int, Array],
+    lines: Lines,
     navigation: NavigationPrior | None,
     p: AdjustParameters,
 ) -> Adjusted:
-    """The poses of `tasks.adjust.adjust` made better by tie points and laser ranges, with their sigmas.
+    """The poses of `tasks.adjust.adjust` made better by tie points and the laser, with their sigmas.
 
     sights : tie points of the links that `chained` used. soundings : (L, 3) of images with a laser, camera frame.
+    lines : the same soundings as lines that cross each other.
     """
     if navigation is not None:
         navigation = with_half_turns(navigation, chained.turned)
     try:
-        found = refine(camera, chained.poses, sights, soundings, navigation, p)
+        found = refine(camera, chained.poses, sights, soundings, lines, navigation, p)
         if found is None:
             return chained
         graph, values = _graph(found.poses, found.block, _COVARIANCE_SIGMA_PX, navigation, p)
@@ -96,8 +100,15 @@ def adjust(
         return chained
     if not (sigma_m[found.poses.known] < _ANYWHERE_M).all():
         return chained
-    rms_px = float(np.sqrt((found.residual_px**2).sum(1).mean()))
-    return chained._replace(poses=found.poses, sigma_m=sigma_m, sigma_tilt_rad=sigma_tilt, reprojection_px=rms_px)
+    rms_px = float(np.sqrt((found.residual_px**2).sum(1).mean())) if len(found.residual_px) else None
+    held = crossovers.holds(found.block.crossed, len(chained.status))
+    return chained._replace(
+        poses=found.poses,
+        sigma_m=sigma_m,
+        sigma_tilt_rad=sigma_tilt,
+        reprojection_px=rms_px,
+        status=["adjusted" if ok else status for status, ok in zip(chained.status, held, strict=True)],
+    )
 
 
 def refine(
@@ -105,31 +116,34 @@ def refine(
     start: Poses,
     sights: Sights,
     soundings: Mapping[int, Array],
+    lines: Lines,
     navigation: NavigationPrior | None,
     p: AdjustParameters,
 ) -> Bundle | None:
-    """The poses that have a start, adjusted together; None where images see no tie point in common.
+    """The poses that have a start, adjusted together; None where images share no tie point and no laser line crosses.
 
-    soundings : (L, 3) of each image with a laser, camera frame.
+    soundings : (L, 3) of each image with a laser, camera frame. lines : the same as lines.
     """
     lit = {k: own for k, own in soundings.items() if start.known[k] and len(own)}
     depth = float(np.median([np.median(own[:, 2]) for own in lit.values()])) if lit else 3.0
     sights = sights.take(start.known[sights.image])
-    bundle, poses = None, start
+    bundle, poses, unknowns = None, start, 0
     sigma_px, rough = _FIRST_SIGMA_PX, laser_ranges.FIRST_ROUGHNESS
     for gate_px, tolerance in zip(_GATES_PX, _TOLERANCES, strict=True):
         gate_px = max(gate_px, _GATE_SIGMAS * sigma_px)
         sights, x, X, focal_px = _inliers(camera, poses, sights, depth, gate_px)
-        if not len(X):
+        crossed = crossovers.believable(crossovers.find(poses, lines), unknowns)
+        if not len(X) and not len(crossed.i):
             return None
         ranges = _believable(poses, X, laser_ranges.measure(poses, X, lit, p.max_ranges), rough)
-        graph, values = _graph(poses, Block(sights, x, X, focal_px, ranges, rough), sigma_px, navigation, p)
+        graph, values = _graph(poses, Block(sights, x, X, focal_px, ranges, rough, crossed), sigma_px, navigation, p)
         values = optimise(graph, values, tolerance)
         poses = read_poses(values, poses)
-        X = np.array([values.atPoint3(_tie_point(n)) for n in range(len(X))])
+        X = np.array([values.atPoint3(_tie_point(n)) for n in range(len(X))]).reshape(-1, 3)
         residual_px = residuals(poses, sights, x, X) * focal_px
         sigma_px, rough = _noise_px(residual_px, len(X)), laser_ranges.roughness(poses, X, ranges)
-        bundle = Bundle(poses, Block(sights, x, X, focal_px, ranges, rough), residual_px, sigma_px)
+        unknowns = crossovers.LEAST_OF_IMAGE * len(np.union1d(crossed.i, crossed.j))
+        bundle = Bundle(poses, Block(sights, x, X, focal_px, ranges, rough, crossed), residual_px, sigma_px)
     return bundle
 
 
@@ -144,6 +158,7 @@ def _graph(
     sigma_m = laser_ranges.sigma(block.ranges.away_m, block.roughness)
     blind = ~np.isin(block.ranges.image, block.sights.image)
     _add_ranges(graph, block.ranges, np.where(blind, _BLIND * sigma_m, sigma_m), p.robust_threshold)
+    crossovers.add(graph, values, poses, block.crossed, 2 * p.robust_threshold)
     return graph, values
 
 
@@ -229,6 +244,8 @@ def _add_ranges(graph: Any, ranges: Ranges, sigma: Array, threshold: float) -> N
 
 def _noise_px(residual_px: Array, points: int) -> float:
     """1-sigma of a sight along either axis, from the residuals that the adjustment left."""
+    if not residual_px.size:
+        return _FIRST_SIGMA_PX
     freedom = max(0.2, 1 - 3 * points / max(1, residual_px.size))
     spread = _MAD_TO_SIGMA * float(np.median(np.abs(residual_px))) / np.sqrt(freedom)
     return float(np.clip(spread, *_SIGMA_PX))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from .calibration_crossovers import crossings
 from .calibration_field import Points
+from .factors import linear, plane_rows
 from .navigation import Poses
 
 Array = NDArray[Any]
@@ -170,3 +171,26 @@ def believable(found: Crossovers, unknowns: int) -> Crossovers:
     if not unknowns:
         factor = max(factor, _FIRST_FACTOR)
     return found.take(ratio < _GATE * factor)._replace(sigma_m=factor * found.sigma_m[ratio < _GATE * factor])
+
+
+def add(graph: Any, values: Any, poses: Poses, found: Crossovers, threshold: float) -> None:
+    """Add factors to a graph, one for each pair of images: at their crossings both are on one surface.
+
+    values : hold the poses. threshold : of Cauchy's kernel, sigmas.
+    """
+    off = found.apart_m / found.sigma_m
+    weight = 1 / np.sqrt(1 + (off / threshold) ** 2) / found.sigma_m
+    A_i = -plane_rows(poses.R_local_camera[found.i], found.a, found.normal) * weight[:, None]
+    A_j = plane_rows(poses.R_local_camera[found.j], found.b, found.normal) * weight[:, None]
+    b = -found.apart_m * weight
+    order = np.lexsort((found.j, found.i))
+    pair = np.column_stack([found.i, found.j])[order]
+    for own in np.split(order, np.flatnonzero(np.any(np.diff(pair, axis=0), axis=1)) + 1) if len(order) else []:
+        i, j = int(found.i[own[0]]), int(found.j[own[0]])
+        graph.add(linear(values, {i: A_i[own], j: A_j[own]}, b[own]))
+
+
+def holds(found: Crossovers, count: int) -> NDArray[np.bool_]:
+    """Which of `count` images so many crossings hold that their height, roll and pitch follow from others."""
+    crossed = np.bincount(found.i, minlength=count) + np.bincount(found.j, minlength=count)
+    return crossed >= LEAST_OF_IMAGE

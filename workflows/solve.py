@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..catalog.store import Entry
-from ..tasks import adjust, bundle, tracks
+from ..tasks import adjust, bundle, crossovers, tracks
 from ..tasks.adjust import Adjusted
 from ..tasks.navigation import NavigationPrior, Poses
 from . import extract, match
@@ -84,8 +84,10 @@ def _bundle(
 ) -> Adjusted:
     camera, p = job.calibration.camera, job.parameters.adjust
     sights = tracks.thin(_sights(job, used), (camera.height, camera.width), p.tie_cells, p.tie_points_per_cell)
-    soundings = {row: load(job, extract.STEP, done.key, ("laser_X",)).arrays["laser_X"] for row, done in lit.items()}
-    return bundle.adjust(camera, chained, sights, soundings, prior, p)
+    arrays = {row: load(job, extract.STEP, done.key, ("laser_X", "laser_arm")).arrays for row, done in lit.items()}
+    soundings = {row: own["laser_X"] for row, own in arrays.items()}
+    lines = crossovers.lines({row: (own["laser_X"], own["laser_arm"]) for row, own in arrays.items()})
+    return bundle.adjust(camera, chained, sights, soundings, lines, prior, p)
 
 
 def _sights(job: Job, used: Sequence[tuple[int, int, Done]]) -> tracks.Sights:
