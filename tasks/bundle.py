@@ -18,7 +18,7 @@ from . import crossovers, laser_ranges
 from .adjust import Adjusted, sigmas
 from .camera import ground_sample_distance, normalised
 from .crossovers import Crossovers, Lines
-from .factors import datum, first_values, navigation_factors, optimise, read_poses
+from .factors import datum, first_values, linear, navigation_factors, optimise, plane_rows, read_poses
 from .laser_ranges import Ranges
 from .navigation import NavigationPrior, Poses, with_half_turns
 from .tracks import Sights
@@ -33,9 +33,10 @@ _TOLERANCES = 1e-2, 1e-2, 1e-3, 3e-4  # of each round: what the next one changes
 _ANYWHERE_M = 100.0  # a sigma beyond this is no knowledge
 _COVARIANCE_SIGMA_PX = 1.0  # of sights, for the covariances: what calibration leaves is shared by many
 _RANGE_GATE = 6.0  # sigmas
-# The errors of ranges beside each other are alike. Sights hold an image against that; one that has none, as laser
-# images have, would slide down the slopes of such errors, so its ranges count as if they were so many times worse.
-_BLIND = 20.0
+# Ranges beside each other are carried along one slope and err alike. Sights hold an image against that; where it has
+# none, as laser images have, so many ranges count as one.
+_ALIKE = 12
+_SLOPE_SIGMA = 0.03
 _RANGE_STEP = 1.1  # ratio of neighbouring sigmas that have a noise model of their own
 _MAD_TO_SIGMA = 1.4826
 
@@ -157,7 +158,8 @@ def _graph(
     _add_sights(graph, values, block.sights, block.x, block.X, sigma_px / block.focal_px, p.robust_threshold)
     sigma_m = laser_ranges.sigma(block.ranges.away_m, block.roughness)
     blind = ~np.isin(block.ranges.image, block.sights.image)
-    _add_ranges(graph, block.ranges, np.where(blind, _BLIND * sigma_m, sigma_m), p.robust_threshold)
+    _add_ranges(graph, block.ranges.take(~blind), sigma_m[~blind], p.robust_threshold)
+    _add_surface(graph, values, poses, block.X, block.ranges.take(blind), np.sqrt(_ALIKE) * sigma_m[blind])
     crossovers.add(graph, values, poses, block.crossed, 2 * p.robust_threshold)
     return graph, values
 
@@ -211,7 +213,7 @@ def _believable(poses: Poses, X: Array, ranges: Ranges, rough: float) -> Ranges:
     left = np.linalg.norm(X[ranges.track] - poses.C_local[ranges.image], axis=1) - ranges.range_m
     level = np.median(left) if len(left) else 0.0  # what all have in common is the scale that they are to tell
     keep = np.abs(left - level) < _RANGE_GATE * laser_ranges.sigma(ranges.away_m, rough)
-    return Ranges(*(values[keep] for values in ranges))
+    return ranges.take(keep)
 
 
 def _tie_point(number: int) -> int:
@@ -240,6 +242,25 @@ def _add_ranges(graph: Any, ranges: Ranges, sigma: Array, threshold: float) -> N
     columns = (ranges.image.tolist(), ranges.track.tolist(), ranges.range_m.tolist(), level.tolist())
     for image, track, range_m, k in zip(*columns, strict=True):
         graph.add(gtsam.RangeFactor3D(image, _tie_point(track), range_m, noises[k]))
+
+
+def _add_surface(graph: Any, values: Any, poses: Poses, X: Array, ranges: Ranges, sigma_m: Array) -> None:
+    """Ranges of images that see no tie point: their laser lies on the surface that the tie points of others make.
+
+    A range holds a camera by the direction in which it looks; a surface holds it along its normal alone, which is all
+    that a laser without features knows.
+    """
+    away = X[ranges.track] - poses.C_local[ranges.image]
+    up = away[:, 2] * (ranges.range_m / np.linalg.norm(away, axis=1) - 1)
+    normal = crossovers.normals(ranges.slope, np.full(len(up), _SLOPE_SIGMA))
+    R = poses.R_local_camera[ranges.image]
+    off = up * normal[:, 2] / sigma_m
+    weight = 1 / np.sqrt(1 + (off / _RANGE_GATE) ** 2) / sigma_m
+    A = plane_rows(R, np.einsum("kji,kj->ki", R, away), normal) * weight[:, None]
+    b = -up * normal[:, 2] * weight
+    for k, (image, track) in enumerate(zip(ranges.image.tolist(), ranges.track.tolist(), strict=True)):
+        blocks = {image: A[k : k + 1], _tie_point(track): -normal[k : k + 1] * weight[k]}
+        graph.add(linear(values, blocks, b[k : k + 1]))
 
 
 def _noise_px(residual_px: Array, points: int) -> float:

@@ -120,8 +120,7 @@ def find(poses: Poses, made: Lines) -> Crossovers:
     sigma = np.hypot(at(p, f, node_sigma), at(q, g, node_sigma))
     line = image * 2 + arm
     slope, doubt = _gradient(_tangent(X, line, p), _tangent(X, line, q), sigma)
-    normal = np.column_stack([-_sure(slope, doubt), np.ones(len(p))])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normals(slope, doubt)
     return Crossovers(
         i=image[p[:, 0]],
         j=image[q[:, 0]],
@@ -151,11 +150,16 @@ def _gradient(u: Array, v: Array, sigma_m: Array) -> tuple[Array, Array]:
     return np.column_stack([east, north]), size * sigma_m / shorter
 
 
-def _sure(slope: Array, sigma: Array) -> Array:
-    """Slopes (K, 2) without what noise alone gives: else level ground would seem to hold images sideways."""
+def normals(slope: Array, sigma: Array) -> Array:
+    """Upward normals (K, 3) of planes that rise by slope (K, 2) to the east and north, known to sigma (K,).
+
+    What noise alone gives is taken off the slopes: else level ground would seem to hold images sideways.
+    """
     square = (slope**2).sum(1)
     sure = np.sqrt(np.maximum(0.0, 1 - (_SLOPE_SIGMAS * sigma) ** 2 / np.maximum(square, 1e-12)))
-    return slope * (sure / np.maximum(1.0, np.sqrt(square) / _STEEPEST))[:, None]
+    sure /= np.maximum(1.0, np.sqrt(square) / _STEEPEST)
+    up = np.column_stack([-slope * sure[:, None], np.ones(len(slope))])
+    return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
 def believable(found: Crossovers, unknowns: int) -> Crossovers:
