@@ -153,3 +153,31 @@ def adjusted(made: Survey) -> Adjusted:
 
 def rigid_rms(poses: Poses, true: Poses) -> float:
     return evaluation.trajectory_errors(poses.C_local, true.C_local).rigid_rms_m
+
+
+class Honesty(NamedTuple):
+    """Root mean squares over surveys: error in sigmas along x, y, z; rigid rms, mm, by navigation and adjusted."""
+
+    z: tuple[float, float, float]
+    navigation_mm: float
+    adjusted_mm: float
+    worse: int
+
+
+def honesty(name: str, seeds) -> Honesty:
+    """Of many surveys of a scene; worse : how many are farther from the truth than their navigation."""
+    z, rms = [], []
+    for seed in seeds:
+        made = survey(name, seed)
+        found = adjusted(made)
+        z.append(((found.poses.C_local - made.true.C_local) / found.sigma_m) ** 2)
+        rms.append([rigid_rms(poses, made.true) for poses in (made.navigation.poses, found.poses)])
+    x, y, up = np.sqrt(np.mean([one.mean(0) for one in z], axis=0)).tolist()
+    before, after = 1e3 * np.sqrt(np.mean(np.square(rms), axis=0))
+    return Honesty((x, y, up), float(before), float(after), sum(b > a for a, b in rms))
+
+
+if __name__ == "__main__":
+    names, number = sys.argv[2:] or ["reef", "sea", "night", "sand", "pairs"], int(sys.argv[1])
+    for each in names:
+        print(each, honesty(each, range(1000, 1000 + number)), flush=True)
