@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..schemas.calibration import Camera
 from ..schemas.parameters import AdjustParameters
 from . import crossovers, laser_ranges
+from . import residuals as left
 from .adjust import Adjusted, sigmas
 from .camera import ground_sample_distance, normalised
 from .crossovers import Crossovers, Lines
@@ -108,6 +109,7 @@ def adjust(
         sigma_m=sigma_m,
         sigma_tilt_rad=sigma_tilt,
         reprojection_px=rms_px,
+        residuals=left.of(len(chained.status), found.block.sights, found.residual_px, found.block.crossed),
         status=["adjusted" if ok else status for status, ok in zip(chained.status, held, strict=True)],
     )
 

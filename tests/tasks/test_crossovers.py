@@ -22,9 +22,7 @@ def test_lines_cross_on_one_surface():
     found = crossovers.find(poses, made)
     assert len(found.i) == 2
     assert set(zip(found.i, found.j, strict=True)) == {(0, 1)}
-    a, b = (
-        x @ poses.R_local_camera[k].T + poses.C_local[k] for k, x in ((0, found.a), (1, found.b))
-    )
+    a, b = (x @ poses.R_local_camera[k].T + poses.C_local[k] for k, x in ((0, found.a), (1, found.b)))
     np.testing.assert_allclose(a[:, :2], b[:, :2], atol=1e-6)
     np.testing.assert_allclose(a[:, 2], scenes.height(0.1, *a[:, :2].T), atol=0.002)
     assert np.abs(found.apart_m).max() < 0.002
