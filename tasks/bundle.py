@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..schemas.calibration import Camera
 from ..schemas.parameters import AdjustParameters
 from . import crossovers, laser_ranges
-from . import residuals as left
+from . import residuals as remaining
 from .adjust import Adjusted, sigmas
 from .camera import ground_sample_distance, normalised
 from .crossovers import Crossovers, Lines
@@ -31,7 +31,7 @@ _LEAST_PARALLAX = 0.015  # radians
 # before each round, what is farther off is a wrong match: pixels, but not less than sigmas
 _GATES_PX, _GATE_SIGMAS = (100.0, 10.0, 1.0, 0.5), 5.0
 _TOLERANCES = 1e-2, 1e-2, 1e-3, 3e-4  # of each round: what the next one changes anyhow need not be found to the end
-_ANYWHERE_M = 100.0  # a sigma beyond this is no knowledge
+_LEAST_SIGHTS = 4  # of an image that tie points hold: three leave several poses
 _COVARIANCE_SIGMA_PX = 1.0  # of sights, for the covariances: what calibration leaves is shared by many
 _RANGE_GATE = 6.0  # sigmas
 # Ranges beside each other are carried along one slope and err alike. Sights hold an image against that; where it has
@@ -98,9 +98,7 @@ def adjust(
             return chained
         graph, values = _graph(found.poses, found.block, _COVARIANCE_SIGMA_PX, navigation, p)
         sigma_m, sigma_tilt = sigmas(graph, values, found.poses, navigation)
-    except (RuntimeError, IndexError):  # GTSAM: something that nothing holds, such as the scale without a laser
-        return chained
-    if not (sigma_m[found.poses.known] < _ANYWHERE_M).all():
+    except RuntimeError:  # GTSAM: a system too near to singular, which counting alone cannot foresee
         return chained
     rms_px = float(np.sqrt((found.residual_px**2).sum(1).mean())) if len(found.residual_px) else None
     held = crossovers.holds(found.block.crossed, len(chained.status))
@@ -109,7 +107,7 @@ def adjust(
         sigma_m=sigma_m,
         sigma_tilt_rad=sigma_tilt,
         reprojection_px=rms_px,
-        residuals=left.of(len(chained.status), found.block.sights, found.residual_px, found.block.crossed),
+        residuals=remaining.of(len(chained.status), found.block.sights, found.residual_px, found.block.crossed),
         status=["adjusted" if ok else status for status, ok in zip(chained.status, held, strict=True)],
     )
 
@@ -123,7 +121,10 @@ def refine(
     navigation: NavigationPrior | None,
     p: AdjustParameters,
 ) -> Bundle | None:
-    """The poses that have a start, adjusted together; None where images share no tie point and no laser line crosses.
+    """The poses that have a start, adjusted together.
+
+    None where images share no tie point and no laser line crosses, or, without navigation, where tie points and laser
+    leave an image or the scale open.
 
     soundings : (L, 3) of each image with a laser, camera frame. lines : the same as lines.
     """
@@ -139,6 +140,8 @@ def refine(
         if not len(X) and not len(crossed.i):
             return None
         ranges = _believable(poses, X, laser_ranges.measure(poses, X, lit, p.max_ranges), rough)
+        if navigation is None and not determined(poses.known, sights, ranges):
+            return None
         graph, values = _graph(poses, Block(sights, x, X, focal_px, ranges, rough, crossed), sigma_px, navigation, p)
         values = optimise(graph, values, tolerance)
         poses = read_poses(values, poses)
@@ -148,6 +151,16 @@ def refine(
         unknowns = crossovers.LEAST_OF_IMAGE * len(np.union1d(crossed.i, crossed.j))
         bundle = Bundle(poses, Block(sights, x, X, focal_px, ranges, rough, crossed), residual_px, sigma_px)
     return bundle
+
+
+def determined(known: NDArray[np.bool_], sights: Sights, ranges: Ranges) -> bool:
+    """Whether tie points join all images that have a pose (n,), and ranges of images that see them give the scale."""
+    if not np.isin(ranges.image, sights.image).any():
+        return False
+    count = len(known)
+    seen = np.bincount(sights.image, minlength=count)
+    joined = remaining.blocks(count + sights.tie_points, np.column_stack([sights.image, count + sights.track]))[:count]
+    return bool((seen[known] >= _LEAST_SIGHTS).all()) and len(np.unique(joined[known])) == 1
 
 
 def _graph(

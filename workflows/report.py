@@ -149,8 +149,8 @@ def _image_figures(quality: Quality) -> Iterator[KeyFigure]:
     yield KeyFigure(
         "Images placed",
         f"{placed:,}",
-        f"{trajectory.adjusted:,} by matches or crossing laser lines, {trajectory.navigation_only:,} by navigation alone; "
-        f"{trajectory.rejected:,} rejected",
+        f"{trajectory.adjusted:,} by matches or crossing laser lines, {trajectory.navigation_only:,} by navigation "
+        f"alone; {trajectory.rejected:,} rejected",
     )
     if trajectory.sigma_median_m is not None:
         x, y, z = trajectory.sigma_median_m
@@ -297,8 +297,8 @@ def _pictures(
     yield _picture(
         "Residuals of images and pairs",
         figures.residuals(quality),
-        "Left: what tie points are off in each image, in order of time. Right: the same of each pair, and how far apart "
-        "the laser lines of a pair are where they cross.",
+        "Left: what tie points are off in each image, in order of time. Right: the same of each pair, and how far "
+        "apart the laser lines of a pair are where they cross.",
     )
     yield _picture(
         "Navigation minus adjusted",

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from seamosaic.schemas.calibration import Camera, Port
 from seamosaic.schemas.parameters import AdjustParameters
-from seamosaic.tasks import bundle, crossovers, tracks
+from seamosaic.tasks import bundle, crossovers, laser_ranges, tracks
 from seamosaic.tasks.adjust import Adjusted
 from seamosaic.tasks.camera import project
 from seamosaic.tasks.navigation import NavigationPrior, Poses
@@ -136,6 +136,20 @@ def test_without_navigation_the_first_image_is_the_datum():
     np.testing.assert_allclose(found.poses.C_local[0], moved.C_local[0], atol=1e-4)
     assert 1e-4 < _rms(found.poses.C_local, poses.C_local) < 0.004
     assert found.sigma_m[0].max() < 1e-4 < found.sigma_m[-1].max() < 0.02
+
+
+def test_without_navigation_tie_points_must_join_all_and_ranges_give_the_scale():
+    rng, poses, points = np.random.default_rng(5), _survey(), scenes.seabed(0.15, count=20_000)
+    sights, known = tracks.join(_matches(LENS, points, poses, rng)), np.ones(18, bool)
+    under = points[np.linalg.norm(points[:, :2] - poses.C_local[0, :2], axis=1) < 0.6]
+    ranges = laser_ranges.measure(poses, under, {0: scenes.cross(0.15, poses, 0, rng)}, 10)
+    assert bundle.determined(known, sights, ranges)
+    assert not bundle.determined(known, sights, ranges.take(np.zeros(len(ranges.image), bool)))
+    halves = sights.image < 9
+    apart = sights._replace(track=np.unique(sights.track * 2 + halves, return_inverse=True)[1])
+    assert not bundle.determined(known, apart, ranges)
+    assert not bundle.determined(known, sights.take(sights.image != 17), ranges)
+    assert bundle.determined(np.arange(18) != 17, sights.take(sights.image != 17), ranges)
 
 
 def test_what_nothing_holds_leaves_the_start():
