@@ -101,13 +101,15 @@ def adjust(
     except RuntimeError:  # GTSAM: a system too near to singular, which counting alone cannot foresee
         return chained
     rms_px = float(np.sqrt((found.residual_px**2).sum(1).mean())) if len(found.residual_px) else None
-    held = crossovers.holds(found.block.crossed, len(chained.status))
+    count = len(chained.status)
+    ranged = np.bincount(found.block.ranges.image, minlength=count) >= crossovers.LEAST_OF_IMAGE * _ALIKE
+    held = ranged | crossovers.holds(found.block.crossed, count)
     return chained._replace(
         poses=found.poses,
         sigma_m=sigma_m,
         sigma_tilt_rad=sigma_tilt,
         reprojection_px=rms_px,
-        residuals=remaining.of(len(chained.status), found.block.sights, found.residual_px, found.block.crossed),
+        residuals=remaining.of(count, found.block.sights, found.residual_px, found.block.crossed),
         status=["adjusted" if ok else status for status, ok in zip(chained.status, held, strict=True)],
     )
 
