@@ -103,7 +103,9 @@ def adjust(
     rms_px = float(np.sqrt((found.residual_px**2).sum(1).mean())) if len(found.residual_px) else None
     count = len(chained.status)
     ranged = np.bincount(found.block.ranges.image, minlength=count) >= crossovers.LEAST_OF_IMAGE * _ALIKE
-    held = ranged | crossovers.holds(found.block.crossed, count)
+    every = crossovers.find(found.poses, lines)
+    kept = crossovers.believable(every, crossovers.LEAST_OF_IMAGE * len(np.unique(lines.image)))
+    held = ranged | crossovers.holds(every, kept, count)
     return chained._replace(
         poses=found.poses,
         sigma_m=sigma_m,

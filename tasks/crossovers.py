@@ -29,6 +29,7 @@ _GATE = 5.0  # sigmas
 _SLOPE_SIGMAS = 2.0  # a slope less sure than this is none
 _STEEPEST = 2.0
 _MAD_TO_SIGMA = 1.4826
+_AGREED = 0.8  # share of an image's crossings
 LEAST_OF_IMAGE = 3  # crossings that hold an image: height, roll and pitch
 
 
@@ -194,7 +195,12 @@ def add(graph: Any, values: Any, poses: Poses, found: Crossovers, threshold: flo
         graph.add(linear(values, {i: A_i[own], j: A_j[own]}, b[own]))
 
 
-def holds(found: Crossovers, count: int) -> NDArray[np.bool_]:
-    """Which of `count` images so many crossings hold that their height, roll and pitch follow from others."""
-    crossed = np.bincount(found.i, minlength=count) + np.bincount(found.j, minlength=count)
-    return crossed >= LEAST_OF_IMAGE
+def holds(every: Crossovers, kept: Crossovers, count: int) -> NDArray[np.bool_]:
+    """Which of `count` images crossings hold: enough for height, roll and pitch, and nearly all of them believable.
+
+    every, kept : before and after `believable`. Where an image is in a wrong place some of its crossings still agree.
+    """
+    found, agreed = (
+        np.bincount(some.i, minlength=count) + np.bincount(some.j, minlength=count) for some in (every, kept)
+    )
+    return (agreed >= LEAST_OF_IMAGE) & (agreed >= _AGREED * found)

@@ -52,11 +52,20 @@ def test_steps_that_no_surface_explains_are_left_out():
     assert (left.sigma_m >= many.sigma_m[:1].min()).all()
 
 
+def test_an_image_is_held_if_nearly_all_of_its_crossings_agree():
+    found = crossovers.find(*_pair())
+    every = crossovers.Crossovers(*(np.concatenate([column] * 5) for column in found))
+    assert crossovers.holds(every, every, 3).tolist() == [True, True, False]
+    assert crossovers.holds(every, every.take(np.arange(10) < 9), 3).tolist() == [True, True, False]
+    assert not crossovers.holds(every, every.take(np.arange(10) < 6), 3).any()
+    assert not crossovers.holds(found, found, 3).any()
+
+
 def test_no_soundings_no_lines():
     poses, _ = _pair()
     none = crossovers.find(poses, crossovers.lines({}))
     assert len(crossovers.believable(none, 0).i) == 0
-    assert not crossovers.holds(none, 2).any()
+    assert not crossovers.holds(none, none, 2).any()
 
 
 @pytest.mark.parametrize("name", ["night", "sand"])
