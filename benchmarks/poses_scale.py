@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from seamosaic.schemas.calibration import Camera
 from seamosaic.schemas.parameters import AdjustParameters
-from seamosaic.tasks import adjust, bundle
+from seamosaic.tasks import adjust, bundle, crossovers
 from seamosaic.tasks.adjust import Link
 from seamosaic.tasks.camera import project
 from seamosaic.tasks.motion import Motion
@@ -110,10 +110,11 @@ def run(count: int) -> float:
     true = survey(count, rng)
     seen, prior, linked = sights(true, rng), navigation(true, rng), links(true, rng)
     lit = {k: soundings(true, k, rng) for k in range(count)}
+    lines = crossovers.lines({k: (X, np.repeat([0, 1], len(X) // 2)) for k, X in lit.items()})
     began = time.process_time()
     chained = adjust.adjust(count, linked, prior, true.R_local_camera[0], p)
     middle = time.process_time()
-    found = bundle.adjust(LENS, chained, seen, lit, prior, p)
+    found = bundle.adjust(LENS, chained, seen, lit, lines, prior, p)
     ended = time.process_time()
     rms = [spread(each.poses.C_local - true.C_local) for each in (chained, found)]
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

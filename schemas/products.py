@@ -115,6 +115,25 @@ class CalibrationQuality(Model):
     ] = None
 
 
+class PairResidual(Model):
+    """What the adjustment left of one pair of images, root mean squares."""
+
+    images: tuple[str, str]
+    tie_points: Annotated[int, Field(ge=0, description="that both images see")] = 0
+    reprojection_px: Annotated[float | None, Field(ge=0, description="of these, pixels at full resolution")] = None
+    crossovers: Annotated[int, Field(ge=0, description="crossings of their laser lines")] = 0
+    apart_m: Annotated[Metres | None, Field(description="distance of the lines there, along the normal")] = None
+
+
+class ImageResidual(Model):
+    """What the adjustment left of one image."""
+
+    image: str
+    block: Annotated[int, Field(ge=0, description="images of one block hold together without navigation")]
+    reprojection_px: Annotated[float | None, Field(ge=0, description="rms, pixels at full resolution")] = None
+    navigation_minus_adjusted_m: Annotated[Vector | None, Field(description="along x, y, z of the map")] = None
+
+
 class PairQuality(Model):
     """Relative motions between overlapping images."""
 
@@ -123,6 +142,9 @@ class PairQuality(Model):
     homography: Count = 0
     essential: Count = 0
     median_inliers: Annotated[float | None, Field(ge=0)] = None
+    crossed: Annotated[int, Field(ge=0, description="pairs of images whose laser lines cross")] = 0
+    crossover_rms_m: Annotated[Metres | None, Field(description="distance of lines at their crossings")] = None
+    residuals: Annotated[tuple[PairResidual, ...], Field(description="pairs that the adjustment holds")] = ()
 
 
 class AxisDifference(Model):
@@ -151,6 +173,11 @@ class TrajectoryQuality(Model):
     reprojection_rms_px: Annotated[
         float | None, Field(ge=0, description="of tie points from where images see them, pixels at full resolution")
     ] = None
+    blocks: Annotated[
+        tuple[int, ...],
+        Field(description="images in each block that matches or crossovers join, largest first"),
+    ] = ()
+    images: Annotated[tuple[ImageResidual, ...], Field(description="images with a pose, in order of time")] = ()
 
 
 class SourceShares(Model):

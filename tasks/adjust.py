@@ -18,6 +18,7 @@ from ..schemas.parameters import AdjustParameters
 from .factors import datum, first_values, gaussian, navigation_factors, optimise, pose, read_poses, robust
 from .motion import Motion
 from .navigation import NavigationPrior, Poses, relative, with_half_turns
+from .residuals import Residuals
 
 Array = NDArray[Any]
 Status = Literal["adjusted", "navigation", "rejected: no link to the first image"]
@@ -53,6 +54,7 @@ class Adjusted(NamedTuple):
     used : (links,) bool, False for links that contradict navigation or each other.
     reprojection_px : rms distance of the tie points from where they are seen; None where none were adjusted.
     turned : (n,) bool, images whose pixels lie the other way round than navigation has them.
+    residuals : what tie points and crossovers left; None where none were adjusted.
     """
 
     poses: Poses
@@ -62,6 +64,7 @@ class Adjusted(NamedTuple):
     used: NDArray[np.bool_]
     turned: NDArray[np.bool_]
     reprojection_px: float | None = None
+    residuals: Residuals | None = None
 
 
 def adjust(

@@ -108,6 +108,25 @@ def _noise(rotation: Array | float, R_local_camera: Array, horizontal_m: float, 
     return gaussian(covariance)
 
 
+def plane_rows(R: Array, X_camera: Array, normal: Array) -> Array:
+    """By how much points of cameras move along normals when the cameras move: (K, 6), rotation and position, right.
+
+    R : (K, 3, 3) R_local_camera. X_camera : (K, 3). normal : (K, 3) local axes.
+    """
+    seen = np.einsum("kji,kj->ki", R, normal)
+    return np.column_stack([np.cross(X_camera, seen), seen])
+
+
+def linear(values: Any, blocks: dict[int, Array], b: Array) -> Any:
+    """Factor of whitened linear observations: the sum of blocks (K, dim) times the steps of the keys from values is b.
+
+    The values are where the observations were made linear.
+    """
+    (i, A_i), (j, A_j) = blocks.items()
+    noise = gtsam.noiseModel.Unit.Create(len(b))
+    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(i, A_i, j, A_j, b, noise), values)
+
+
 def robust(noise: Any, threshold: float) -> Any:
     """Huber's kernel of a threshold, sigmas, over a noise."""
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(threshold), noise)

@@ -33,6 +33,7 @@ class Observations(NamedTuple):
     Attributes
     ----------
     image, track : (M,). is_range : (M,) bool. value : (M, 2) slopes, or the range, metres, and 0. sigma : (M,) of it.
+    normal : (M, 3) camera frame: along it the range is taken, where it is not 0; else along the line of sight.
     threshold : sigmas, of Cauchy's kernel.
     tracks, contacts, images : groups of rows of one tie point, of one tie point in one camera, of one camera.
     by_image : (M,) rows, camera after camera.
@@ -45,6 +46,7 @@ class Observations(NamedTuple):
     is_range: NDArray[np.bool_]
     value: Array
     sigma: Array
+    normal: Array
     threshold: float
     tracks: "Groups"
     contacts: "Groups"
@@ -64,13 +66,13 @@ class Groups(NamedTuple):
 
 
 def observations(
-    sights: Sights, x: Array, sigma: float, ranges: Ranges, sigma_m: Array, threshold: float
+    sights: Sights, x: Array, sigma: float, ranges: Ranges, sigma_m: Array, normal: Array, threshold: float
 ) -> Observations:
-    """Rows of sights with slopes x (M, 2) and of ranges with their sigmas (K,), and what joins what."""
+    """Rows of sights with slopes x (M, 2) and of ranges with their sigmas (K,) and normals (K, 3); what joins what."""
     image, track = np.concatenate([sights.image, ranges.image]), np.concatenate([sights.track, ranges.track])
     order = np.lexsort((image, track))
     image, track = image[order], track[order]
-    count = int(image.max()) + 1
+    count = int(image.max(initial=0)) + 1
     contacts, tracks = _groups(track * count + image), _groups(track)
     by_image = np.argsort(image, kind="stable")
     pairs, first, second, ends = _pairs(contacts.number % count, contacts.number // count)
@@ -81,6 +83,7 @@ def observations(
         is_range=order >= len(x),
         value=value[order],
         sigma=np.concatenate([np.full(len(x), sigma), sigma_m])[order],
+        normal=np.concatenate([np.zeros((len(x), 3)), normal])[order],
         threshold=threshold,
         tracks=tracks,
         contacts=contacts,
@@ -100,8 +103,8 @@ def _groups(numbers: Indices) -> Groups:
 
 def _pairs(image: Indices, track: Indices) -> tuple[Indices, Indices, Indices, Indices]:
     """Pairs of cameras and their contacts, as `Observations` has them, from the camera and point of each contact."""
-    found, count = [], int(image.max()) + 1
-    for step in range(1, int(np.bincount(track).max())):
+    found, count = [], int(image.max(initial=0)) + 1
+    for step in range(1, int(np.bincount(track, minlength=1).max())):
         first = np.flatnonzero(track[step:] == track[:-step])
         found.append((first, first + step))
     first, second = (np.concatenate(c) for c in zip(*found, strict=True)) if found else (image[:0], image[:0])
@@ -145,8 +148,14 @@ def _seen(o: Observations, poses: Poses, X: Array) -> Array:
 def _left(o: Observations, seen: Array) -> Array:
     """What is left of the rows (M, 2), in sigmas."""
     found = seen[:, :2] / seen[:, 2:]
-    found[o.is_range, 0], found[o.is_range, 1] = np.linalg.norm(seen[o.is_range], axis=1), 0.0
+    found[o.is_range, 0], found[o.is_range, 1] = (seen * _toward(o, seen))[o.is_range].sum(1), 0.0
     return (found - o.value) / o.sigma[:, None]
+
+
+def _toward(o: Observations, seen: Array) -> Array:
+    """Directions (M, 3), camera frames, along which ranges are taken."""
+    own = (o.normal != 0).any(1, keepdims=True)
+    return np.where(own, o.normal, seen / np.linalg.norm(seen, axis=1, keepdims=True))
 
 
 def linearised(o: Observations, poses: Poses, X: Array) -> Blocks:
@@ -172,7 +181,7 @@ def _by_seen(o: Observations, seen: Array) -> Array:
     found[:, 0, 0] = found[:, 1, 1] = 1 / seen[:, 2]
     found[:, :, 2] = -seen[:, :2] / seen[:, 2:] ** 2
     found[o.is_range] = 0.0
-    found[o.is_range, 0] = seen[o.is_range] / np.linalg.norm(seen[o.is_range], axis=1, keepdims=True)
+    found[o.is_range, 0] = _toward(o, seen)[o.is_range]
     return found
 
 
@@ -263,7 +272,7 @@ def solve(fixed: Any, start: State, o: Observations, tolerance: float, afloat: b
                 return state
             made = reduced(o, blocks, damping)
             made.graph.push_back(held)
-            made.graph.add(_anchor(o, _ANCHOR if afloat else 0.0))
+            made.graph.add(_anchor(state.poses, _ANCHOR if afloat else 0.0))
             ordering = ordering or _elimination_order(made.graph)
             with suppress(RuntimeError):  # too weakly held for Cholesky's way: damping helps
                 trial = _stepped(o, state, made, made.graph.optimize(ordering))
@@ -280,11 +289,16 @@ def _elimination_order(graph: Any) -> Any:
     return gtsam.Ordering.MetisGaussianFactorGraph(graph)
 
 
-def _anchor(o: Observations, information: float, right: Array | None = None) -> Any:
+def _middle(poses: Poses) -> int:
+    """The camera in the middle of those that have a pose."""
+    known = np.flatnonzero(poses.known)
+    return int(known[len(known) // 2])
+
+
+def _anchor(poses: Poses, information: float, right: Array | None = None) -> Any:
     """A factor that holds one camera where it is, or pushes it by `right` (6,)."""
-    k = int(o.images.number[len(o.images.number) // 2])
     weight = np.diag([0.0, 0.0, 0.0, *[information] * 3])
-    return gtsam.HessianFactor(k, weight, np.zeros(6) if right is None else right, 0.0)
+    return gtsam.HessianFactor(_middle(poses), weight, np.zeros(6) if right is None else right, 0.0)
 
 
 def covariances(fixed: Any, state: State, o: Observations) -> Array:
@@ -302,7 +316,7 @@ def covariances(fixed: Any, state: State, o: Observations) -> Array:
     graph = reduced(o, linearised(o, state.poses, state.X), 0.0).graph
     graph.push_back(fixed.linearize(state.values))
     order = _elimination_order(graph)
-    graph.add(_anchor(o, _ANCHOR))
+    graph.add(_anchor(state.poses, _ANCHOR))
     tree = graph.eliminateMultifrontal(order)
     middle = tree.optimize()
     known = [k for k in np.flatnonzero(state.poses.known).tolist() if middle.exists(k)]
@@ -312,10 +326,10 @@ def covariances(fixed: Any, state: State, o: Observations) -> Array:
     for axis in range(3):
         pushed = gtsam.GaussianFactorGraph()
         pushed.push_back(graph)
-        pushed.add(_anchor(o, 0.0, np.eye(6)[3 + axis]))
+        pushed.add(_anchor(state.poses, 0.0, np.eye(6)[3 + axis]))
         delta = pushed.optimize(order)
         across[known, :, axis] = [delta.at(k) - middle.at(k) for k in known]
-    of_anchor = across[int(o.images.number[len(o.images.number) // 2]), 3:]
+    of_anchor = across[_middle(state.poses), 3:]
     left = np.eye(3) / _ANCHOR - (of_anchor + of_anchor.T) / 2
     if np.linalg.eigvalsh(left)[0] < _NOTHING_LEFT / _ANCHOR:
         raise RuntimeError("nothing but the anchor holds the map")

@@ -21,7 +21,7 @@ from ..schemas.products import MeshQuality, Quality
 from ..schemas.provenance import InputFile, Provenance
 from ..tasks import mesh, rotations
 from ..tasks.grids import Bounds, Grid
-from . import calibration_quality, extract, maps, mosaics, quality, report, report_figures
+from . import calibration_quality, extract, maps, mosaics, quality, report, report_figures, residual_quality
 from .job import code_version, load
 from .results import Results, span, vertical_reference
 from .solve import Solution
@@ -40,6 +40,7 @@ _VERSION = code_version(
     report,
     quality,
     calibration_quality,
+    residual_quality,
 )
 _MESH_CELLS = 2_000_000
 _NAMED_BY = ("image", "role", "time", "status", "sha256")

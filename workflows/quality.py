@@ -22,7 +22,7 @@ from ..schemas.products import (
     SourceShares,
     TrajectoryQuality,
 )
-from . import calibration_quality
+from . import calibration_quality, residual_quality
 from .results import Results, span, vertical_reference
 
 
@@ -41,6 +41,8 @@ def figures(
     """
     opened = results.opened
     calibration = calibration_quality.measured(results)
+    solution = results.posed.solution
+    block = residual_quality.held_together(solution)
     roles = Counter(str(role) for role in opened.frames["role"].values)
     start, end = span(opened)
     return Quality(
@@ -57,13 +59,19 @@ def figures(
         soundings=_sounding_quality(results, soundings),
         calibration=calibration,
         pairs=_pair_quality(results),
-        trajectory=_trajectory_quality(rows, navigation, results.posed.solution.reprojection_px),
+        trajectory=_trajectory_quality(rows, navigation, solution.reprojection_px).model_copy(
+            update={
+                "blocks": residual_quality.sizes(rows, block),
+                "images": tuple(residual_quality.images(rows, navigation, solution, block)),
+            }
+        ),
         bathymetry=_bathymetry_quality(folder, results.mapped.cell_m),
         mosaic=_mosaic_quality(results),
         mesh=triangles,
         warnings=(
             *opened.warnings,
             *_doubts(rows, results),
+            *residual_quality.doubts(rows, block),
             *calibration_quality.doubts(calibration, calibration_quality.typical_range(results)),
         ),
     )
@@ -73,7 +81,10 @@ def _doubts(rows: Sequence[trajectories.Row], results: Results) -> Iterator[str]
     """What the figures show but a hurried reader may miss."""
     alone = sum(row.kind == "navigation" for row in rows)
     if alone:
-        yield f"{alone} of {len(rows)} images are placed by navigation alone: no match with another image holds them"
+        yield (
+            f"{alone} of {len(rows)} images are placed by navigation alone: neither matches nor crossing laser lines "
+            "hold them"
+        )
     turned = [rows[k].image for k in np.flatnonzero(results.posed.solution.turned).tolist()]
     if turned:
         names = ", ".join(turned[:6]) + (" ..." if len(turned) > 6 else "")
@@ -107,12 +118,16 @@ def _pair_quality(results: Results) -> PairQuality:
     used = {(int(i), int(j)) for i, j in results.posed.solution.pairs}
     linked = [done.info for i, j, done in results.posed.matched if (i, j) in used]
     models = Counter(info["model"] for info in linked)
+    left, names = results.posed.solution.residuals, [str(name) for name in results.opened.frames["image"].values]
     return PairQuality(
         tried=len(results.posed.matched),
         linked=len(linked),
         homography=models["homography"],
         essential=models["essential"],
         median_inliers=float(np.median([info["inliers"] for info in linked])) if linked else None,
+        crossed=0 if left is None else len(left.crossed),
+        crossover_rms_m=residual_quality.crossover_rms(results.posed.solution),
+        residuals=tuple(residual_quality.pairs(names, results.posed.solution)),
     )
 
 

@@ -41,7 +41,7 @@ class Scene:
         lit = np.flatnonzero(np.isin(np.flatnonzero(near), chosen))
         length = np.linalg.norm(self.X[number[lit]] - C[image[near][lit]], axis=1)
         range_m = length + rng.normal(0, SIGMA_M, len(lit))
-        self.ranges = Ranges(image[near][lit], number[lit], range_m, np.zeros(len(lit)))
+        self.ranges = Ranges(image[near][lit], number[lit], range_m, np.zeros(len(lit)), np.zeros((len(lit), 2)))
         drift = np.cumsum(rng.normal(0, 0.02, (COUNT, 3)), 0)
         self.start = Poses(
             self.true.R_local_camera @ Rotation.from_rotvec(rng.normal(0, 0.004, (COUNT, 3))).as_matrix(), C + drift
@@ -58,7 +58,8 @@ class Scene:
 
     def observations(self):
         sigma_m = np.full(len(self.ranges.track), SIGMA_M)
-        return reduction.observations(self.sights, self.x, SIGMA, self.ranges, sigma_m, THRESHOLD)
+        normal = np.zeros((len(sigma_m), 3))
+        return reduction.observations(self.sights, self.x, SIGMA, self.ranges, sigma_m, normal, THRESHOLD)
 
     def gtsam(self, fixed):
         """The same adjustment with a variable for each tie point."""
@@ -73,7 +74,7 @@ class Scene:
         for image, track, x in zip(self.sights.image, self.sights.track, self.x, strict=True):
             key, noise = gtsam.symbol("x", int(track)), robust(2, SIGMA)
             graph.add(gtsam.GenericProjectionFactorCal3_S2(x, noise, int(image), key, gtsam.Cal3_S2()))
-        for image, track, range_m, _ in zip(*self.ranges, strict=True):
+        for image, track, range_m in zip(*self.ranges[:3], strict=True):
             graph.add(gtsam.RangeFactor3D(int(image), gtsam.symbol("x", int(track)), range_m, robust(1, SIGMA_M)))
         return graph, values
 
@@ -123,6 +124,35 @@ def test_the_covariances_are_gtsams(scene):
         expected = theirs.marginalCovariance(k)
         scale = np.sqrt(np.diag(expected))
         np.testing.assert_allclose(found[k] / np.outer(scale, scale), expected / np.outer(scale, scale), atol=2e-3)
+
+
+def test_distances_along_normals_are_derived_as_they_change(scene):
+    """Gradients of the error by poses and tie points against differences, with ranges along normals of their own."""
+    count, rng = len(scene.ranges.track), np.random.default_rng(3)
+    normal = rng.normal(0, 0.2, (count, 3)) + [0, 0, -1]
+    normal[::3] = 0
+    seen = scene.X[scene.ranges.track] - scene.start.C_local[scene.ranges.image]
+    seen = np.einsum("kji,kj->ki", scene.start.R_local_camera[scene.ranges.image], seen)
+    own = (normal != 0).any(1)
+    length = np.where(own, (seen * normal).sum(1), np.linalg.norm(seen, axis=1)) + rng.normal(0, SIGMA_M, count)
+    ranges, sigma_m = scene.ranges._replace(range_m=length), np.full(count, SIGMA_M)
+    o = reduction.observations(scene.sights, scene.x, 1.0, ranges, sigma_m, normal, 1e3)
+    found = reduction.linearised(o, scene.start, scene.X)
+
+    def error(step, k, X):
+        R, C = scene.start.R_local_camera.copy(), scene.start.C_local.copy()
+        C[k] += R[k] @ step[3:]
+        R[k] = R[k] @ Rotation.from_rotvec(step[:3]).as_matrix()
+        return reduction.error(o, Poses(R, C), X)
+
+    small = 1e-6
+    for k in range(COUNT):
+        by_pose = [(error(small * e, k, scene.X) - error(-small * e, k, scene.X)) / (2 * small) for e in np.eye(6)]
+        np.testing.assert_allclose(by_pose, -found.g_pose[k], rtol=1e-3, atol=1e-2)
+    n = int(ranges.track[own][0])
+    moves = [small * np.eye(3)[axis] * (np.arange(len(scene.X)) == n)[:, None] for axis in range(3)]
+    by_point = [(error(np.zeros(6), 0, scene.X + m) - error(np.zeros(6), 0, scene.X - m)) / (2 * small) for m in moves]
+    np.testing.assert_allclose(by_point, -found.g_point[n], rtol=1e-3, atol=1e-2)
 
 
 def test_what_nothing_holds_is_said(scene):
