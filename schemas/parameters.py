@@ -129,6 +129,32 @@ class GridParameters(Model):
     tile_cells: Annotated[int, Field(ge=64, le=8192)] = 512
 
 
+class RingParameters(Model):
+    """The ring of a bathymetric position index: how far from a cell its neighbourhood begins and ends."""
+
+    inner: Annotated[float, Field(ge=0, description="where the ring begins")]
+    outer: Annotated[float, Field(gt=0, le=1000, description="where it ends, this distance included")]
+    unit: Annotated[Literal["cells", "metres"], Field(description="of inner and outer")] = "cells"
+
+    @model_validator(mode="after")
+    def _ring_not_empty(self) -> "RingParameters":
+        if self.inner > self.outer:
+            expected = f"at most outer, {self.outer:g}"
+            raise inconsistent("inner", f"{self.inner:g}", expected, "Swap or correct the two.")
+        return self
+
+
+class TerrainParameters(Model):
+    """Habitat layers: slope, aspect, curvature, position, ruggedness, contours."""
+
+    fine: Annotated[RingParameters, Field(description="bathymetric position index of small forms")] = RingParameters(
+        inner=1, outer=5
+    )
+    broad: Annotated[RingParameters, Field(description="bathymetric position index of large forms")] = RingParameters(
+        inner=5, outer=25
+    )
+
+
 class MosaicParameters(Model):
     """Orthomosaic and planar mosaic."""
 
@@ -161,5 +187,6 @@ class Parameters(Model):
     adjust: AdjustParameters = AdjustParameters()
     bathymetry: BathymetryParameters = BathymetryParameters()
     grid: GridParameters = GridParameters()
+    terrain: TerrainParameters = TerrainParameters()
     mosaic: MosaicParameters = MosaicParameters()
     mesh: MeshParameters = MeshParameters()

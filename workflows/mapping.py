@@ -8,11 +8,11 @@ from dask.delayed import delayed
 from ..tasks import camera as cameras
 from ..tasks import grids, pairs
 from ..tasks.grids import Grid
-from . import dense, maps, mosaics
+from . import dense, layers, maps, mosaics
 from .job import Done
 from .maps_inputs import Image, MapJob, Pair, Tile
 from .plan import batches
-from .results import Mapped, Posed, Tiles
+from .results import Mapped, Posed, TerrainLayers, Tiles
 from .session import Session, compute
 from .solve import Solution
 
@@ -45,10 +45,11 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     outlines = _outlines(state, posed.solution, ranges)
     linked, agreed = _dense(state, m, posed, images, outlines, ranges)
     surface_tiles = _surface(state, m, linked, agreed, images, outlines)
+    terrain = _layers(state, m, surface_tiles)
     textured = [image for image in images if image.texture]
     light = _lighting(state, m, textured)
     mosaic = _mosaics(state, m, textured or images, outlines, surface_tiles, mosaic_cell, light, posed)
-    return Mapped(m, cell, mosaic_cell, surface_tiles, mosaic, outlines)
+    return Mapped(m, cell, mosaic_cell, surface_tiles, terrain, mosaic, outlines)
 
 
 def _images(state: Session, posed: Posed, ranges: np.ndarray) -> list[Image]:
@@ -205,6 +206,32 @@ def _surface(
     for step, done in zip(steps, (cells, [growth], surfaces), strict=True):
         state.ledger.end(step, done)
     return Tiles(grid, tuple(zip(tiles, surfaces, strict=True)))
+
+
+def _layers(state: Session, m: MapJob, surface: Tiles) -> TerrainLayers:
+    """Habitat layers of each tile, then its contours, whose interval is one for the whole map."""
+    halo = layers.reach(state.job.parameters.terrain, m.cell_m)
+    for step in (layers.TERRAIN, layers.CONTOURS):
+        state.ledger.begin(step)
+
+    def near(grid: Grid) -> list[tuple[Grid, Done]]:
+        return [(tile, done) for tile, done in surface.tiles if grids.intersection(grid, tile)]
+
+    tasks = [
+        delayed(layers.terrain_tile)(m, tile, near(grids.pad(tile, halo)), dask_key_name=f"terrain-{k}")
+        for k, (tile, _) in enumerate(surface.tiles)
+    ]
+    made: list[Done] = compute(state, layers.TERRAIN, tasks)
+    interval = layers.contour_interval_m(made)
+    tasks = [
+        delayed(layers.contour_tile)(m, tile, near(layers.contour_grid(tile)), interval, dask_key_name=f"contours-{k}")
+        for k, (tile, _) in enumerate(surface.tiles)
+    ]
+    lines: list[Done] = compute(state, layers.CONTOURS, tasks)
+    for step, done in ((layers.TERRAIN, made), (layers.CONTOURS, lines)):
+        state.ledger.end(step, done)
+    tiles = tuple((tile, done) for (tile, _), done in zip(surface.tiles, made, strict=True))
+    return TerrainLayers(Tiles(surface.grid, tiles), tuple(lines), interval)
 
 
 def _lighting(state: Session, m: MapJob, images: Sequence[Image]) -> Done | None:

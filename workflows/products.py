@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,9 @@ from ..catalog.store import digest
 from ..schemas.mission import Mission
 from ..schemas.products import MeshQuality, Quality
 from ..schemas.provenance import InputFile, Provenance
-from ..tasks import mesh, rotations
+from ..tasks import contours, derivatives, mesh, rotations
 from ..tasks.grids import Bounds, Grid
-from . import calibration_quality, extract, maps, mosaics, quality, report, report_figures
+from . import calibration_quality, extract, layers, maps, mosaics, quality, report, report_figures
 from .job import code_version, load
 from .results import Results, span, vertical_reference
 from .solve import Solution
@@ -36,6 +37,7 @@ _VERSION = code_version(
     rasters,
     trajectories,
     vectors,
+    contours,
     mesh,
     report,
     quality,
@@ -48,7 +50,8 @@ _NAMED_BY = ("image", "role", "time", "status", "sha256")
 def write(results: Results) -> tuple[Path, bool, Quality]:
     """Write the next version, unless the newest was made from the same: its folder, whether new, its figures."""
     job, mapped = results.job, results.mapped
-    keys = [done.key for _, done in (*mapped.surface.tiles, *mapped.mosaic.tiles)]
+    tiles = *mapped.surface.tiles, *mapped.terrain.layers.tiles, *mapped.mosaic.tiles
+    keys = [done.key for done in (*(done for _, done in tiles), *mapped.terrain.contours)]
     keys += [done.key for done in results.posed.extracted.values()] + [results.posed.adjusted.key]
     inputs = sorted(f"{name}:{sha}" for name, sha in results.opened.input_digests.items())
     frames = results.opened.frames
@@ -68,6 +71,7 @@ def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
     rows, navigation = _trajectory(results)
     trajectories.write(folder / "trajectory.csv", rows)
     _write_bathymetry(results, folder, crs_wkt)
+    _write_terrain(results, folder, crs_wkt)
     _write_mosaics(results, folder, crs_wkt)
     count = _write_soundings(results, folder, crs_wkt)
     triangles = _write_mesh(folder, crs_wkt, results)
@@ -179,6 +183,22 @@ def _write_bathymetry(results: Results, folder: Path, crs_wkt: str) -> None:
     )
 
 
+def _write_terrain(results: Results, folder: Path, crs_wkt: str) -> None:
+    found, job = results.mapped.terrain.layers, results.job
+    fine, broad = layers.rings(job.parameters.terrain, results.mapped.cell_m)
+    rings = {"bpi-fine": fine, "bpi-broad": broad}
+    with ExitStack() as stack:
+        files = {}
+        for name in derivatives.LAYERS:
+            tags = {"MISSION": results.opened.mission.id}
+            if name in rings:
+                tags["RING"] = quality.ring_text(quality.ring_scale(rings[name], results.mapped.cell_m))
+            files[name] = stack.enter_context(_writer(folder, f"terrain/{name}.tif", found.grid, crs_wkt, tags))
+        for tile, done in found.tiles:
+            for name, values in load(job, layers.TERRAIN, done.key).arrays.items():
+                files[name].write(*_inner(found.grid, tile), values)
+
+
 def _write_mosaics(results: Results, folder: Path, crs_wkt: str) -> None:
     tags = {"MISSION": results.opened.mission.id}
     mosaic, job = results.mapped.mosaic, results.job
@@ -254,16 +274,19 @@ def _write_survey(results: Results, folder: Path, crs_wkt: str, rows: Sequence[t
         for k, row in enumerate(rows)
     ]
     placed = [row for row in rows if row.pose is not None]
-    overview = rasters.read_overview(folder / "bathymetry.tif")
-    elevation = overview.values[0].astype(float)
+    parts = [
+        contours.Contours(**load(results.job, layers.CONTOURS, done.key).arrays)
+        for done in results.mapped.terrain.contours
+    ]
+    lines = contours.join(parts, results.mapped.cell_m).lines()
     vectors.write_survey(
         folder / "survey.gpkg",
         crs_wkt,
         footprints,
         np.array([row.pose.position for row in placed if row.pose]).reshape(-1, 3),
         np.array([row.time for row in placed], "datetime64[ns]"),
-        vectors.contours(overview, vectors.contour_interval(elevation)),
-        vectors.coverage(overview),
+        [vectors.Contour(elevation, line) for elevation, line in lines],
+        vectors.coverage(rasters.read_overview(folder / "bathymetry.tif")),
     )
 
 

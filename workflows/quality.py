@@ -18,11 +18,14 @@ from ..schemas.products import (
     NavigationDifference,
     PairQuality,
     Quality,
+    RingScale,
     SoundingQuality,
     SourceShares,
+    TerrainQuality,
     TrajectoryQuality,
 )
-from . import calibration_quality
+from ..tasks.derivatives import Ring
+from . import calibration_quality, layers
 from .results import Results, span, vertical_reference
 
 
@@ -59,6 +62,7 @@ def figures(
         pairs=_pair_quality(results),
         trajectory=_trajectory_quality(rows, navigation, results.posed.solution.reprojection_px),
         bathymetry=_bathymetry_quality(folder, results.mapped.cell_m),
+        terrain=_terrain_quality(results, folder),
         mosaic=_mosaic_quality(results),
         mesh=triangles,
         warnings=(
@@ -157,6 +161,34 @@ def _bathymetry_quality(folder: Path, cell_m: float) -> BathymetryQuality:
         elevation_max_m=heights.maximum,
         sigma_median_m=sigma.median,
     )
+
+
+def _terrain_quality(results: Results, folder: Path) -> TerrainQuality:
+    cell = results.mapped.cell_m
+    fine, broad = layers.rings(results.job.parameters.terrain, cell)
+    slope, vrm, rugosity, roughness = (
+        rasters.summarise(folder / f"terrain/{name}.tif").median for name in ("slope", "vrm", "rugosity", "roughness")
+    )
+    return TerrainQuality(
+        slope_deg=slope,
+        vrm=vrm,
+        rugosity=rugosity,
+        roughness_m=roughness,
+        bpi_fine=ring_scale(fine, cell),
+        bpi_broad=ring_scale(broad, cell),
+        contour_interval_m=results.mapped.terrain.interval_m,
+    )
+
+
+def ring_scale(ring: Ring, cell_m: float) -> RingScale:
+    """A ring in cells and in metres."""
+    inner, outer = ring
+    return RingScale(inner_cells=inner, outer_cells=outer, inner_m=inner * cell_m, outer_m=outer * cell_m)
+
+
+def ring_text(scale: RingScale) -> str:
+    """A ring's scale in words."""
+    return f"{scale.inner_cells} to {scale.outer_cells} cells, {scale.inner_m:g} to {scale.outer_m:g} m"
 
 
 def _mosaic_quality(results: Results) -> MosaicQuality:

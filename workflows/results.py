@@ -32,6 +32,14 @@ class Tiles(NamedTuple):
     tiles: tuple[tuple[Grid, Done], ...]
 
 
+class TerrainLayers(NamedTuple):
+    """Habitat layers, and the contours of each tile with their interval."""
+
+    layers: Tiles
+    contours: tuple[Done, ...]
+    interval_m: float
+
+
 class Mapped(NamedTuple):
     """Results of the map tiles. outlines : (n, M, 2) footprints in map coordinates."""
 
@@ -39,6 +47,7 @@ class Mapped(NamedTuple):
     cell_m: float
     mosaic_cell_m: float
     surface: Tiles
+    terrain: TerrainLayers
     mosaic: Tiles
     outlines: np.ndarray
 

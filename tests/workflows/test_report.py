@@ -115,6 +115,13 @@ def full_quality():
             elevation_max_m=-19.0,
             sigma_median_m=0.01,
         ),
+        terrain=products.TerrainQuality(
+            slope_deg=12.4,
+            rugosity=1.062,
+            bpi_fine=products.RingScale(inner_cells=1, outer_cells=5, inner_m=0.02, outer_m=0.1),
+            bpi_broad=products.RingScale(inner_cells=5, outer_cells=25, inner_m=0.1, outer_m=0.5),
+            contour_interval_m=0.2,
+        ),
         mosaic=products.MosaicQuality(cell_m=0.0021, area_m2=41, coverage_share=0.976),
         mesh=products.MeshQuality(vertices=200_000, triangles=399_000),
         warnings=("2 images are truncated",),

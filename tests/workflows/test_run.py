@@ -15,6 +15,7 @@ import numpy as np
 import pyogrio
 import pytest
 import rasterio
+import shapely
 import trimesh
 import xarray
 import yaml
@@ -23,6 +24,7 @@ from seamosaic.catalog import trajectories
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.products import PRODUCTS
+from seamosaic.tasks import derivatives
 from seamosaic.workflows import run as runner
 from seamosaic.workflows.evaluate import evaluate
 from seamosaic.workflows.mapping import NothingToMap
@@ -65,6 +67,45 @@ def test_every_product_is_there_and_opens_elsewhere(reef):
     with xarray.open_dataset(folder / "bathymetry.nc") as layers:
         assert "elevation" in layers
     assert "<html" in (folder / "report.html").read_text()
+
+
+def test_terrain_layers_of_tiles_have_the_bits_of_the_whole_map(reef, small_tiles):
+    """Each run's layers against those of its whole bathymetry.tif at once."""
+    for result in (reef.result, small_tiles):
+        with rasterio.open(result.path / "bathymetry.tif") as file:
+            z, cell = file.read(1, masked=True).filled(np.nan).astype(float), file.res[0]
+        whole = derivatives.layers(z, cell, derivatives.Ring(1, 5), derivatives.Ring(5, 25))
+        for name, values in whole.items():
+            with rasterio.open(result.path / f"terrain/{name}.tif") as file:
+                written = file.read(1, masked=True).filled(np.nan)
+                assert file.tags().get("RING", "").startswith("5 to 25 cells, 0.1") == (name == "bpi-broad")
+            assert np.isfinite(written).sum() > 1000
+            assert np.array_equal(written, values, equal_nan=True), name
+
+
+def test_terrain_layers_follow_their_rings_alone(reef, tmp_path):
+    shutil.copytree(reef.out, tmp_path / "out")
+    parameters = Parameters.model_validate({"terrain": {"broad": {"inner": 0.2, "outer": 0.4, "unit": "metres"}}})
+    result = run(str(reef.mission), tmp_path / "out", parameters, scheduler="sync")
+    assert {step for step, count in _computed(result).items() if count} == {"terrain"}
+    scale = result.quality.terrain.bpi_broad
+    assert scale.outer_cells == round(0.4 / result.quality.bathymetry.cell_m)
+    assert scale.outer_m == pytest.approx(0.4, abs=result.quality.bathymetry.cell_m)
+    too_wide = Parameters.model_validate({"terrain": {"broad": {"inner": 0, "outer": 90, "unit": "metres"}}})
+    with pytest.raises(InvalidInput, match=r"terrain.broad.outer.*smaller ring"):
+        run(str(reef.mission), tmp_path / "out", too_wide, scheduler="sync")
+
+
+def test_contours_of_the_survey_lie_on_the_bathymetry(reef):
+    _, _, geometries, (elevations,) = pyogrio.raw.read(reef.result.path / "survey.gpkg", layer="contours")
+    assert len(geometries) > 5
+    with rasterio.open(reef.result.path / "bathymetry.tif") as file:
+        for wkb, elevation in zip(geometries, elevations, strict=True):
+            points = shapely.get_coordinates(shapely.from_wkb(wkb))
+            found = np.array([value[0] for value in file.sample(points[::7])])
+            assert np.median(np.abs(found[found > -9000] - elevation)) < 0.05
+    interval = reef.result.quality.terrain.contour_interval_m
+    assert np.allclose(elevations / interval, np.rint(elevations / interval))
 
 
 def test_products_agree_with_the_truth(reef):
@@ -165,11 +206,17 @@ def test_dense_matching_can_be_left_out_and_measured_cells_become_interpolated(r
     assert _computed(run(str(reef.mission), tmp_path / "out", fewer, scheduler="sync"))["dense"] == 0
 
 
-def test_small_tiles_many_of_them_empty_give_the_same_maps(reef, tmp_path):
-    """The track runs across the map: no image touches the tiles in its corners."""
-    shutil.copytree(reef.out, tmp_path / "out")
+@pytest.fixture(scope="module")
+def small_tiles(reef, tmp_path_factory):
+    out = tmp_path_factory.mktemp("small-tiles") / "out"
+    shutil.copytree(reef.out, out)
     parameters = Parameters.model_validate({"grid": {"tile_cells": 64}, "mosaic": {"tile_cells": 512}})
-    result = run(str(reef.mission), tmp_path / "out", parameters, scheduler="sync")
+    return run(str(reef.mission), out, parameters, scheduler="sync")
+
+
+def test_small_tiles_many_of_them_empty_give_the_same_maps(reef, small_tiles):
+    """The track runs across the map: no image touches the tiles in its corners."""
+    result = small_tiles
     assert _computed(result)["cells"] > 6
     for name in ("bathymetry.tif", "source.tif", "mosaic-source.tif"):
         with rasterio.open(result.path / name) as small, rasterio.open(reef.result.path / name) as large:
