@@ -240,7 +240,7 @@ def test_a_local_mission_without_laser_mosaic_or_soundings(tmp_path):
     make_soundings(tmp_path, 0, rasters.local_crs_wkt())
     mission = products.MissionSummary(id="pool", images=products.ImageCounts(total=12))
     page, text = write(tmp_path, products.Quality(mission=mission))
-    assert set(page.images) == {"Bathymetry", "Uncertainty", "Source", "Density", "Track"}
+    assert set(page.images) == {"Bathymetry", "Uncertainty", "Source", "Density", "Track", *TERRAIN}
     for heading in ("Orthomosaic", "Planar mosaic", *FIGURES):
         assert "No data to show" in page.texts[heading]
     assert "no navigation" in page.texts["Navigation minus adjusted"]
