@@ -172,10 +172,14 @@ class MosaicParameters(Model):
 
 
 class MeshParameters(Model):
-    """Textured surface."""
+    """Textured surface: how much of the pyramid in mesh-3dtiles/ goes into the files mesh.glb and mesh.ply."""
 
-    max_triangles: Annotated[int, Field(ge=100, le=20_000_000)] = 400_000
-    texture_px: Annotated[int, Field(ge=256, le=16384, description="longest side of the texture")] = 4096
+    max_triangles: Annotated[
+        int, Field(ge=100, le=20_000_000, description="the finest level with no more than these is taken")
+    ] = 400_000
+    texture_px: Annotated[
+        int, Field(ge=256, le=16384, description="mesh.glb has no more texture than a square of this side, pixels")
+    ] = 6144
 
 
 class Parameters(Model):

@@ -67,6 +67,12 @@ PRODUCTS: Final[tuple[Product, ...]] = (
     Product("mesh.ply", "Coloured surface about a local origin", "application/ply", "data"),
     Product("mesh.glb", "Textured surface about a local origin, for viewers", "model/gltf-binary", "visual"),
     Product(
+        "mesh-3dtiles/tileset.json",
+        "The whole surface at full detail, as 3D Tiles 1.1: this file names the others",
+        "application/json",
+        "visual",
+    ),
+    Product(
         "soundings.laz", "Every accepted laser point with image number, arm and sigma", "application/vnd.laszip", "data"
     ),
     Product("trajectory.csv", "Position, attitude, sigma and status of every image", "text/csv", "data"),
@@ -227,8 +233,12 @@ class MosaicQuality(Model):
 class MeshQuality(Model):
     """The surface."""
 
-    vertices: Count
-    triangles: Count
+    vertices: Annotated[Count, Field(description="of mesh.ply")]
+    triangles: Annotated[Count, Field(description="of mesh.ply and mesh.glb")]
+    level: Annotated[Count, Field(description="of the pyramid that these two files are, 0 the finest")] = 0
+    error_m: Annotated[Metres | None, Field(description="most that the bathymetry is away from their triangles")] = None
+    tiles: Annotated[Count, Field(description="of all levels, in mesh-3dtiles/")] = 0
+    finest_triangles: Annotated[Count, Field(description="of the finest tiles together")] = 0
 
 
 class Quality(Model):

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-from dask.delayed import delayed
+from dask.delayed import Delayed, delayed
 
 from ..tasks import camera as cameras
 from ..tasks import grids, pairs
 from ..tasks.grids import Grid
-from . import dense, layers, maps, mosaics
+from . import dense, layers, maps, meshing, mosaics
 from .job import Done
 from .maps_inputs import Image, MapJob, Pair, Tile
 from .plan import batches
@@ -49,7 +49,8 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     textured = [image for image in images if image.texture]
     light = _lighting(state, m, textured)
     mosaic = _mosaics(state, m, textured or images, outlines, surface_tiles, mosaic_cell, light, posed)
-    return Mapped(m, cell, mosaic_cell, surface_tiles, terrain, mosaic, outlines)
+    pyramid = _mesh(state, m, textured, outlines, surface_tiles, mosaic, light)
+    return Mapped(m, cell, mosaic_cell, surface_tiles, terrain, mosaic, pyramid, outlines)
 
 
 def _images(state: Session, posed: Posed, ranges: np.ndarray) -> list[Image]:
@@ -274,6 +275,39 @@ def _mosaics(
     for step, results in ((mosaics.ALIGN, [aligned]), (mosaics.MOSAIC, done)):
         state.ledger.end(step, results)
     return Tiles(grid, tuple(zip(tiles, done, strict=True)))
+
+
+def _mesh(
+    state: Session,
+    m: MapJob,
+    images: Sequence[Image],
+    outlines: np.ndarray,
+    ground: Tiles,
+    mosaic: Tiles,
+    light: Done | None,
+) -> dict[meshing.Place, Done]:
+    """The pyramid of mesh tiles, each level from the one below."""
+    state.ledger.begin(meshing.MESH)
+    margin, cell = _margin(outlines, images), mosaic.grid.cell_m
+    finest, *coarser = meshing.levels(list(meshing.leaves(ground.grid)))
+    tasks: dict[meshing.Place, Delayed] = {}
+    for place in finest:
+        own, around, texture = meshing.leaf_inputs(m, place, cell)
+        near = [(tile, done) for tile, done in ground.tiles if grids.intersection(around, tile)]
+        pictures = [(tile, done) for tile, done in mosaic.tiles if grids.intersection(texture, tile)]
+        shown = _touching(outlines, images, own, margin)
+        given = (m, place, shown, near, pictures, light, cell)
+        tasks[place] = delayed(meshing.leaf)(*given, dask_key_name=f"mesh-{'-'.join(map(str, place))}")
+    below = finest
+    for level in coarser:
+        for place in level:
+            children = [(child, tasks[child]) for child in below if child.parent == place]
+            name = f"mesh-{'-'.join(map(str, place))}"
+            tasks[place] = delayed(meshing.parent)(m, place, children, dask_key_name=name)
+        below = level
+    made: list[Done] = compute(state, meshing.MESH, list(tasks.values()))
+    state.ledger.end(meshing.MESH, made)
+    return dict(zip(tasks, made, strict=True))
 
 
 def range_of(done: Done | None, fallback: float) -> float:

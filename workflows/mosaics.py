@@ -100,19 +100,18 @@ def mosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], alig
     inputs = [*_inputs(tile, solution), *(done.key for _, done in ground), aligned.key, light.key if light else ""]
 
     def make() -> Made:
-        model = _model(m.job, light)
+        model = light_model(m.job, light)
         small = [model and _thumbnail(m.job, image, solution.poses, model) for image in tile.images]
-        shots = [_shot(m.job, image, thumbnail) for image, thumbnail in zip(tile.images, small, strict=True)]
-        tone = _tone(m.job.calibration.camera, model) if model else None
+        shots = [shot(m.job, image, thumbnail) for image, thumbnail in zip(tile.images, small, strict=True)]
+        toned = tone(m.job.calibration.camera, model) if model else None
         both = _on_surface(m, tile, ground, solution.poses), _on_plane(m, tile, aligned, solution.poses)
         plans = [
-            mosaic.plan(tile.grid, place, [(shot, lies[shot.number]) for shot in shots], tone) for place, lies in both
+            mosaic.plan(tile.grid, place, [(one, lies[one.number]) for one in shots], toned) for place, lies in both
         ]
         images = {image.row: image for image in tile.images}
 
         def read(row: int, reduce: int) -> np.ndarray:
-            bgr = extract.read_verified(m.job, images[row].path, images[row].sha256, reduce)
-            return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+            return read_image(m.job, images[row], reduce)
 
         cv2.setNumThreads(1)
         ortho, flat = mosaic.compose(plans, read, times, m.job.parameters.mosaic.gamma if light else 1.0)
@@ -131,7 +130,7 @@ def _on_surface(
     elevation = np.full(around.shape, np.nan)
     for grid, done in ground:
         paste(around, elevation, grid, load(m.job, SURFACE, done.key, ("ground",)).arrays["ground"])
-    local = _affine(m.frame, tile.grid, elevation)
+    local = local_affine(m.frame, tile.grid, elevation)
     lies = {
         image.row: nodes.lie(local, poses.R_local_camera[image.row], poses.C_local[image.row]) for image in tile.images
     }
@@ -146,14 +145,14 @@ def _on_plane(m: MapJob, tile: Tile, aligned: Done, poses: Poses) -> tuple[nodes
     return nodes.flat_ground(tile.grid), lies
 
 
-def _affine(frame: MapFrame, tile: Grid, elevation: np.ndarray) -> frames.LocalAffine:
+def local_affine(frame: MapFrame, tile: Grid, elevation: np.ndarray) -> frames.LocalAffine:
     """The map around a tile's middle."""
     z = float(np.nanmean(elevation)) if np.isfinite(elevation).any() else 0.0
     west, south, east, north = tile.bounds
     return frame.affine_at(np.array([(west + east) / 2, (south + north) / 2, z]))
 
 
-def _shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
+def shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
     """An image without its pixels: which of them the laser lights, and its colours in small."""
     entry = load(job, extract.STEP, image.key, ("line_uv",))
     lens = job.calibration.camera
@@ -168,7 +167,8 @@ def _shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
     return Shot(image.row, lens, nodes.qualities(erase, scale), thumbnail)
 
 
-def _model(job: Job, light: Done | None) -> water.Water | None:
+def light_model(job: Job, light: Done | None) -> water.Water | None:
+    """What lamps and water do, as `lighting` found it; None for pixels as they were taken."""
     if light is None:
         return None
     a = load(job, LIGHTING, light.key).arrays
@@ -183,11 +183,19 @@ def _thumbnail(job: Job, image: Image, poses: Poses, model: water.Water) -> np.n
     return water.without_holes(small * gain - veil)
 
 
-def _tone(lens: Camera, model: water.Water) -> mosaic.Tone:
-    def tone(u: np.ndarray, v: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def read_image(job: Job, image: Image, times: int) -> np.ndarray:
+    """An image, red green blue, so many times smaller."""
+    bgr = extract.read_verified(job, image.path, image.sha256, times)
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+
+
+def tone(lens: Camera, model: water.Water) -> mosaic.Tone:
+    """What an image's light is multiplied with, less what, by pixel and distance."""
+
+    def at(u: np.ndarray, v: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return water.tone(model, nodes.small_at(model.light, lens, u, v), range_m)
 
-    return tone
+    return at
 
 
 VERSIONS = dict.fromkeys((LIGHTING, ALIGN, MOSAIC), _VERSION)

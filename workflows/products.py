@@ -9,20 +9,18 @@ from typing import Any
 
 import numpy as np
 import pyproj
-import rasterio
 from pyproj.crs import CompoundCRS
-from rasterio.enums import Resampling
 
-from ..catalog import meshes, metadata, netcdf, pointclouds, rasters, trajectories, vectors, versions
+from ..catalog import meshes, metadata, netcdf, pointclouds, rasters, tiles3d, trajectories, vectors, versions
 from ..catalog.mission_files import MissionFiles
 from ..catalog.missions import OpenedMission
 from ..catalog.store import digest
 from ..schemas.mission import Mission
-from ..schemas.products import MeshQuality, Quality
+from ..schemas.products import Quality
 from ..schemas.provenance import InputFile, Provenance
-from ..tasks import contours, derivatives, mesh, rotations
-from ..tasks.grids import Bounds, Grid
-from . import calibration_quality, extract, layers, maps, mosaics, quality, report, report_figures
+from ..tasks import contours, derivatives, rotations
+from ..tasks.grids import Grid
+from . import calibration_quality, extract, layers, maps, mesh_products, mosaics, quality, report, report_figures
 from .job import code_version, load
 from .results import Results, span, vertical_reference
 from .solve import Solution
@@ -38,12 +36,12 @@ _VERSION = code_version(
     trajectories,
     vectors,
     contours,
-    mesh,
+    mesh_products,
+    tiles3d,
     report,
     quality,
     calibration_quality,
 )
-_MESH_CELLS = 2_000_000
 _NAMED_BY = ("image", "role", "time", "status", "sha256")
 
 
@@ -51,7 +49,7 @@ def write(results: Results) -> tuple[Path, bool, Quality]:
     """Write the next version, unless the newest was made from the same: its folder, whether new, its figures."""
     job, mapped = results.job, results.mapped
     tiles = *mapped.surface.tiles, *mapped.terrain.layers.tiles, *mapped.mosaic.tiles
-    keys = [done.key for done in (*(done for _, done in tiles), *mapped.terrain.contours)]
+    keys = [done.key for done in (*(done for _, done in tiles), *mapped.terrain.contours, *mapped.mesh.values())]
     keys += [done.key for done in results.posed.extracted.values()] + [results.posed.adjusted.key]
     inputs = sorted(f"{name}:{sha}" for name, sha in results.opened.input_digests.items())
     frames = results.opened.frames
@@ -74,7 +72,7 @@ def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
     _write_terrain(results, folder, crs_wkt)
     _write_mosaics(results, folder, crs_wkt)
     count = _write_soundings(results, folder, crs_wkt)
-    triangles = _write_mesh(folder, crs_wkt, results)
+    triangles = mesh_products.write(results, folder, crs_wkt)
     _write_survey(results, folder, crs_wkt, rows)
     figures = quality.figures(results, folder, rows, navigation, count, triangles)
     metadata.write_quality(folder / "quality.json", figures)
@@ -231,40 +229,6 @@ def _write_soundings(results: Results, folder: Path, crs_wkt: str) -> int:
             file.write(results.plan.frame.map_from_local(X), frame, arrays["laser_arm"], sigma)
             count += len(X)
     return count
-
-
-def _write_mesh(folder: Path, crs_wkt: str, results: Results) -> MeshQuality:
-    """The surface, thinned to a bounded size, textured with the orthomosaic."""
-    p, grid = results.job.parameters.mesh, results.mapped.surface.grid
-    step = max(1, int(np.ceil(np.sqrt(grid.width * grid.height / _MESH_CELLS))))
-    coarse = Grid(grid.cell_m * step, 0, 0, -(-grid.width // step), -(-grid.height // step))
-    with rasterio.open(folder / "bathymetry.tif") as file:
-        z = file.read(1, out_shape=coarse.shape, masked=True, resampling=Resampling.average).astype(float)
-    with rasterio.open(folder / "mosaic.tif") as file:
-        shrink = max(1.0, max(file.width, file.height) / p.texture_px)
-        size = max(1, round(file.height / shrink)), max(1, round(file.width / shrink))
-        texture = np.moveaxis(file.read(out_shape=(3, *size), resampling=Resampling.average), 0, -1)
-        edges = file.bounds
-    # a coarse cell need not lie on whole multiples of itself in the map: it counts from the grid's corner
-    west, _, _, north = grid.bounds
-    moved = Bounds(edges.left - west, edges.bottom - north, edges.right - west, edges.top - north)
-    origin = np.array([west, north, 0.0])
-    made = mesh.surface_mesh(z.filled(np.nan), coarse, np.zeros(3), moved, p.max_triangles)
-    uv = np.column_stack([made.uv[:, 0], 1 - made.uv[:, 1]])  # images begin at the north, meshes at the south
-    comments = [f"offset {west:.3f} {north:.3f} 0.000", f"crs {crs_wkt}"]
-    colours = _sampled(texture, uv)
-    meshes.write_ply(folder / "mesh.ply", made.vertices, made.triangles, colours, comments=comments)
-    about = {"crs": crs_wkt, "offset": origin.tolist()}
-    meshes.write_glb(folder / "mesh.glb", made.vertices, made.triangles, uv, texture, about)
-    return MeshQuality(vertices=len(made.vertices), triangles=len(made.triangles))
-
-
-def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Colours (V, 3) of a texture (h, w, 3) at uv (V, 2), row 0 at v = 0."""
-    height, width = texture.shape[:2]
-    column = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
-    row = np.clip((uv[:, 1] * height).astype(int), 0, height - 1)
-    return texture[row, column]
 
 
 def _write_survey(results: Results, folder: Path, crs_wkt: str, rows: Sequence[trajectories.Row]) -> None:

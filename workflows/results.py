@@ -12,6 +12,7 @@ from ..schemas.provenance import Step
 from ..tasks.grids import Grid
 from .job import Done, Job
 from .maps_inputs import MapJob
+from .meshing import Place
 from .plan import Plan
 from .solve import Solution
 
@@ -49,6 +50,7 @@ class Mapped(NamedTuple):
     surface: Tiles
     terrain: TerrainLayers
     mosaic: Tiles
+    mesh: dict[Place, Done]
     outlines: np.ndarray
 
 
