@@ -26,7 +26,7 @@ def write(results: Results, folder: Path, crs_wkt: str) -> MeshQuality:
     origin = np.array([west, north, 0.0])
     about = {"crs": crs_wkt, "offset": origin.tolist()}
     _write_tiles(results, folder / _FOLDER, None if results.opened.crs is None else crs_wkt, origin, about)
-    level = _level(pyramid, results.job.parameters.mesh.max_triangles)
+    level = level_of_file(pyramid, results.job.parameters.mesh.max_triangles)
     chosen = {place: done for place, done in pyramid.items() if place.level == level and done.info["triangles"]}
     shrink = _shrink(list(chosen.values()), results.job.parameters.mesh.texture_px)
     parts = [_part(results, place, done, origin, shrink) for place, done in chosen.items()]
@@ -45,7 +45,7 @@ def write(results: Results, folder: Path, crs_wkt: str) -> MeshQuality:
     )
 
 
-def _level(pyramid: dict[Place, Done], max_triangles: int) -> int:
+def level_of_file(pyramid: dict[Place, Done], max_triangles: int) -> int:
     """The finest level that is not too large, or the coarsest."""
     last = max(place.level for place in pyramid)
     for level in range(last):

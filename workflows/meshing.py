@@ -194,7 +194,8 @@ def _orthomosaic(m: MapJob, own: Grid, wanted: Grid, pictures: Sequence[tuple[Gr
         return None
     if not mask.all():
         small = wanted.width // _SMALLER + 1, wanted.height // _SMALLER + 1
-        holes = np.asarray(cv2.resize((~mask).astype(np.uint8), small, interpolation=cv2.INTER_AREA)) > 0
+        empty = np.where(mask, np.uint8(0), np.uint8(255))
+        holes = np.asarray(cv2.resize(empty, small, interpolation=cv2.INTER_AREA)) > 0
         rgb = np.where(mask[..., None], rgb, mosaic.paint_over(rgb, holes))
     return _between_nodes(rgb, wanted, own)
 
