@@ -152,8 +152,8 @@ class RasterWriter:
             "tiled": True,
             "blockxsize": _BLOCK,
             "blockysize": _BLOCK,
-            "compress": "deflate",
-            "zlevel": 1,
+            "compress": "zstd",  # what is read once again
+            "zstd_level": 1,
             "sparse_ok": True,
             "bigtiff": "if_safer",
         }

@@ -189,15 +189,26 @@ def _orthomosaic(m: MapJob, own: Grid, wanted: Grid, pictures: Sequence[tuple[Gr
             continue
         arrays = load(m.job, mosaics.MOSAIC, done.key, ("rgb", "mask")).arrays
         at, part = grids.window(wanted, shared), grids.window(grid, shared)
-        rgb[at], mask[at] = np.moveaxis(arrays["rgb"][:, *part], 0, -1), arrays["mask"][part]
+        rgb[at], mask[at] = (
+            cv2.merge([np.ascontiguousarray(band) for band in arrays["rgb"][:, *part]]),
+            arrays["mask"][part],
+        )
     if not mask.any():
         return None
     if not mask.all():
-        small = wanted.width // _SMALLER + 1, wanted.height // _SMALLER + 1
-        empty = np.where(mask, np.uint8(0), np.uint8(255))
-        holes = np.asarray(cv2.resize(empty, small, interpolation=cv2.INTER_AREA)) > 0
-        rgb = np.where(mask[..., None], rgb, mosaic.paint_over(rgb, holes))
+        _fill(rgb, mask)
     return _between_nodes(rgb, wanted, own)
+
+
+def _fill(rgb: np.ndarray, mask: np.ndarray) -> None:
+    """Give pixels (rows, columns, 3) without a picture the colours around them, smoothly."""
+    small = mask.shape[1] // _SMALLER + 1, mask.shape[0] // _SMALLER + 1
+    share = cv2.resize(mask.astype(np.float32), small, interpolation=cv2.INTER_AREA)
+    known = cv2.resize(rgb, small, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-3)[..., None]
+    known = np.clip(np.rint(known), 0, 255).astype(np.uint8)
+    filled = mosaic.paint_over(known, share < 0.5)
+    wide = cv2.resize(filled, mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    cv2.copyTo(wide, (~mask).astype(np.uint8), rgb)
 
 
 def _between_nodes(rgb: np.ndarray, pixels: Grid, own: Grid) -> np.ndarray:

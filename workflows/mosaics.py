@@ -2,11 +2,13 @@
 
 import sys
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 
+from ..catalog.store import Store
 from ..schemas.calibration import Camera
 from ..tasks import camera, colour, frames, laser, mosaic, nodes, planar, terrain, water
 from ..tasks.frames import MapFrame
@@ -14,13 +16,14 @@ from ..tasks.grids import Grid
 from ..tasks.navigation import Poses
 from ..tasks.nodes import Lie, Shot
 from . import extract, match, solve
-from .job import Done, Job, Made, code_version, load, once, stage
+from .job import Done, Job, LostEntry, Made, code_version, load, once, stage
 from .maps import SURFACE, ground_around, paste
 from .maps_inputs import Image, MapJob, Pair, Tile, context, pose_digest, rows_of
 from .solve import Solution
 
 LIGHTING, ALIGN, MOSAIC = "lighting", "planar-align", "mosaic"
 _VERSION = code_version(sys.modules[__name__])
+_REMEMBERED = 64  # images, of which 0.2 MB each
 
 
 def lighting(m: MapJob, images: Sequence[Image]) -> Done:
@@ -154,8 +157,16 @@ def local_affine(frame: MapFrame, tile: Grid, elevation: np.ndarray) -> frames.L
 
 def shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
     """An image without its pixels: which of them the laser lights, and its colours in small."""
-    entry = load(job, extract.STEP, image.key, ("line_uv",))
     lens = job.calibration.camera
+    return Shot(image.row, lens, _qualities(job.store, image.key, lens.model_dump_json()), thumbnail)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _qualities(store: Store, key: str, lens_json: str) -> np.ndarray:
+    """Which pixels of an image are how good, by the key of its extraction: tiles one after the other ask for it."""
+    entry, lens = store.get(extract.STEP, key, ("line_uv",)), Camera.model_validate_json(lens_json)
+    if entry is None:
+        raise LostEntry(f"{store.path(extract.STEP, key)} is gone or damaged; run again to make it anew")
     scale = nodes.quality_scale(lens)
     shape = -(-lens.height // scale), -(-lens.width // scale)
     erase = np.zeros(shape, bool)
@@ -164,7 +175,7 @@ def shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
         erase[np.clip(v, 0, shape[0] - 1), np.clip(u, 0, shape[1] - 1)] = True
         line = np.argwhere(erase)[:, ::-1].astype(float)  # each pixel once
         erase = laser.mask(shape, line, entry.info["halfwidth_px"] / scale + 0.5)
-    return Shot(image.row, lens, nodes.qualities(erase, scale), thumbnail)
+    return nodes.qualities(erase, scale)
 
 
 def light_model(job: Job, light: Done | None) -> water.Water | None:
