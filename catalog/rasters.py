@@ -105,6 +105,9 @@ LAYERS: Final[Mapping[str, Layer]] = {
     },
     "mosaic.tif": Layer(_RGB, "uint8", None, mask=True),
     "mosaic-source.tif": Layer(("row of trajectory.csv, from 0",), "int32", -1, resampling="nearest"),
+    "mosaic-painted.tif": Layer(
+        ("1 painted: only images that the laser lights there see it",), "uint8", 0, resampling="nearest"
+    ),
     "mosaic-planar.tif": Layer(_RGB, "uint8", None, mask=True),
 }
 

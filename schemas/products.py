@@ -63,6 +63,12 @@ PRODUCTS: Final[tuple[Product, ...]] = (
     Product(
         "mosaic-source.tif", "Which image is behind each mosaic pixel: row of trajectory.csv, from 0", _COG, "data"
     ),
+    Product(
+        "mosaic-painted.tif",
+        "1 where only laser light shows the seabed and colours are those around it, else 0",
+        _COG,
+        "data",
+    ),
     Product("mosaic-planar.tif", "Conventional 2D mosaic that takes the seabed as a plane, to compare", _COG, "visual"),
     Product("mesh.ply", "Coloured surface about a local origin", "application/ply", "data"),
     Product("mesh.glb", "Textured surface about a local origin, for viewers", "model/gltf-binary", "visual"),
@@ -228,6 +234,9 @@ class MosaicQuality(Model):
     cell_m: Annotated[float, Field(gt=0)]
     area_m2: Annotated[float, Field(ge=0)]
     coverage_share: Annotated[Share | None, Field(description="of the area with an elevation")] = None
+    painted_share: Annotated[
+        Share | None, Field(description="of the mosaic, where only laser light shows the seabed: mosaic-painted.tif")
+    ] = None
 
 
 class MeshQuality(Model):

@@ -27,6 +27,7 @@ from .nodes import (
     BLOCK,
     ERASED,
     ERASED_M,
+    HIDDEN_M,
     OUTSIDE,
     Ground,
     Lie,
@@ -86,12 +87,17 @@ class Laid(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A tile before its colours: source (rows, columns of its blocks) int32 is -1 where nothing is seen."""
+    """A tile before its colours.
+
+    source (rows, columns of its blocks) int32 is -1 where nothing is seen; painted where only laser light shows the
+    place.
+    """
 
     tile: Grid
     place: Ground
     laid: tuple[Laid, ...]
     source: NDArray[np.int32]
+    painted: Mask
 
 
 class Mosaic(NamedTuple):
@@ -102,11 +108,14 @@ class Mosaic(NamedTuple):
     rgb : (3, height, width) uint8, 0 where nothing was seen.
     mask : (height, width) whether anything was seen.
     source : (height, width) int32, number of the image behind most of each cell, -1 none.
+    painted : (height, width) whether the laser lights the cell in every image that sees it, so that its colours are
+        those around it.
     """
 
     rgb: Pixels
     mask: Mask
     source: NDArray[np.int32]
+    painted: Mask
 
 
 def plan(
@@ -124,17 +133,17 @@ def plan(
     found = [(shot, see(place, shot, lie, feather_m)) for shot, lie in shots]
     views = [(shot, seen) for shot, seen in found if seen is not None]
     best = _upper_bound(place, views, feather_m)
-    source = np.full(place.blocks.shape, -1, np.int32)
+    source, painted = np.full(place.blocks.shape, -1, np.int32), np.zeros(place.blocks.shape, bool)
     patches: list[list[Patch]] = [[] for _ in views]
     reach = _REACH_FEATHERS * feather_m + place.nodes.cell_m
     for (row, column), rivals in sorted(_rivals(place, views, best, reach).items()):
         at = slice(row * BLOCK, (row + 1) * BLOCK), slice(column * BLOCK, (column + 1) * BLOCK)
-        source[at] = _share_out(place, views, rivals, (row, column), feather_m, patches)
+        source[at], painted[at] = _share_out(place, views, rivals, (row, column), feather_m, patches)
     tones = _tones(place, views, patches, best, tone, feather_m)
     laid = [
         Laid(shot, seen, parts, *both) for (shot, seen), parts, both in zip(views, patches, tones, strict=True) if parts
     ]
-    return Plan(tile, place, tuple(laid), source)
+    return Plan(tile, place, tuple(laid), source, painted)
 
 
 def _part(place: Ground, seen: Seen) -> tuple[slice, slice]:
@@ -192,11 +201,11 @@ def _share_out(
     block: tuple[int, int],
     feather_m: float,
     patches: list[list[Patch]],
-) -> NDArray[np.int32] | int:
-    """Weights of the images in a block, added to their patches; the number of the image behind each pixel."""
+) -> tuple[NDArray[np.int32] | int, Mask | bool]:
+    """Weights of the images in a block, added to their patches; of each pixel the image and whether it is painted."""
     if len(rivals) == 1 and _clean(place, views[rivals[0]][1], block):
         patches[rivals[0]].append(Patch(*block, None, False))
-        return views[rivals[0]][0].number
+        return views[rivals[0]][0].number, False
     costs = [_pixel_cost(place, *views[k], block, feather_m) for k in rivals]
     lowest, first = _lowest(costs)
     seen_at_all = np.isfinite(lowest)
@@ -210,7 +219,8 @@ def _share_out(
             painted = bool(((cost >= ERASED_M) & (share > 0)).any())
             patches[k].append(Patch(*block, share.astype(np.uint8), painted))
     numbers = np.array([views[k][0].number for k in rivals], np.int32)
-    return np.where(seen_at_all, numbers[first], np.int32(-1))
+    lit = seen_at_all & (np.where(seen_at_all, lowest, 0) % HIDDEN_M >= ERASED_M)  # hidden too, or not
+    return np.where(seen_at_all, numbers[first], np.int32(-1)), lit
 
 
 def _lowest(costs: Sequence[Array32]) -> tuple[Array32, NDArray[np.uint16]]:
@@ -358,7 +368,7 @@ def _finish(made: Plan, total: Array32, gamma: float) -> Mosaic:
         rgb[:, rows] = [
             levels.take(np.asarray(band, np.uint16), mode="wrap") for band in cv2.split(_as_16_bits(light[rows]))
         ]
-    return Mosaic(rgb, source >= 0, np.ascontiguousarray(source))
+    return Mosaic(rgb, source >= 0, np.ascontiguousarray(source), np.ascontiguousarray(made.painted[at]))
 
 
 def _as_16_bits(light: NDArray) -> NDArray[np.uint16]:

@@ -119,10 +119,10 @@ def mosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], alig
         cv2.setNumThreads(1)
         ortho, flat = mosaic.compose(plans, read, times, m.job.parameters.mosaic.gamma if light else 1.0)
         arrays = {**ortho._asdict(), "planar_rgb": flat.rgb, "planar_mask": flat.mask}
-        return Made(arrays, {"pixels": int(ortho.mask.sum())})
+        return Made(arrays, {"pixels": int(ortho.mask.sum()), "painted": int(ortho.painted.sum())})
 
     parameters = [*_context(m, tile), sorted(times.items())]
-    return once(m.job, MOSAIC, _VERSION, inputs, parameters, make, ("mask", "source", "planar_mask"))
+    return once(m.job, MOSAIC, _VERSION, inputs, parameters, make, ("mask", "source", "painted", "planar_mask"))
 
 
 def _on_surface(

@@ -203,12 +203,14 @@ def _write_mosaics(results: Results, folder: Path, crs_wkt: str) -> None:
     with (
         _writer(folder, "mosaic.tif", mosaic.grid, crs_wkt, tags) as colours,
         _writer(folder, "mosaic-source.tif", mosaic.grid, crs_wkt, tags) as sources,
+        _writer(folder, "mosaic-painted.tif", mosaic.grid, crs_wkt, tags) as painted,
         _writer(folder, "mosaic-planar.tif", mosaic.grid, crs_wkt, tags) as planar,
     ):
         for tile, done in mosaic.tiles:
             arrays, place = load(job, mosaics.MOSAIC, done.key).arrays, _inner(mosaic.grid, tile)
             colours.write(*place, arrays["rgb"], arrays["mask"])
             sources.write(*place, arrays["source"])
+            painted.write(*place, arrays["painted"])
             planar.write(*place, arrays["planar_rgb"], arrays["planar_mask"])
 
 

@@ -196,4 +196,10 @@ def _mosaic_quality(results: Results) -> MosaicQuality:
     pixels = sum(done.info["pixels"] for _, done in results.mapped.mosaic.tiles)
     surface = sum(done.info["cells"] for _, done in results.mapped.surface.tiles) * results.mapped.cell_m**2
     area = pixels * cell**2
-    return MosaicQuality(cell_m=cell, area_m2=area, coverage_share=min(1.0, area / surface) if surface else None)
+    painted = sum(done.info["painted"] for _, done in results.mapped.mosaic.tiles)
+    return MosaicQuality(
+        cell_m=cell,
+        area_m2=area,
+        coverage_share=min(1.0, area / surface) if surface else None,
+        painted_share=painted / pixels if pixels else None,
+    )

@@ -60,7 +60,16 @@ def test_every_product_is_there_and_opens_elsewhere(reef):
     assert folder.name == "v1"
     for product in PRODUCTS:
         assert (folder / product.name).stat().st_size > 0, product.name
-    for name in ("bathymetry", "uncertainty", "density", "source", "mosaic", "mosaic-source", "mosaic-planar"):
+    for name in (
+        "bathymetry",
+        "uncertainty",
+        "density",
+        "source",
+        "mosaic",
+        "mosaic-source",
+        "mosaic-painted",
+        "mosaic-planar",
+    ):
         assert cog_validate(folder / f"{name}.tif", quiet=True)[0], name
     with laspy.open(folder / "soundings.laz") as cloud:
         assert cloud.header.point_count == reef.result.quality.soundings.count > 1000
@@ -197,6 +206,18 @@ def test_the_laser_is_gone_from_the_mosaic(reef):
         red, green, blue = file.read().astype(int)
         excess = (green - np.maximum(red, blue))[file.dataset_mask() > 0]
     assert (excess > 60).mean() < 2e-3
+
+
+def test_what_only_the_laser_shows_is_marked(reef):
+    with (
+        rasterio.open(reef.result.path / "mosaic-painted.tif") as marked,
+        rasterio.open(reef.result.path / "mosaic.tif") as mosaic,
+    ):
+        painted, there = marked.read(1) > 0, mosaic.dataset_mask() > 0
+    assert not (painted & ~there).any()
+    share = reef.result.quality.mosaic.painted_share
+    assert painted.sum() / there.sum() == pytest.approx(share, rel=1e-6)
+    assert 1e-4 < share < 0.1  # the cross in images at the edge of a survey of 8
 
 
 def test_mosaic_source_counts_rows_of_the_trajectory(reef):
