@@ -27,7 +27,6 @@ from .nodes import (
     BLOCK,
     ERASED,
     ERASED_M,
-    HIDDEN_M,
     OUTSIDE,
     Ground,
     Lie,
@@ -219,8 +218,8 @@ def _share_out(
             painted = bool(((cost >= ERASED_M) & (share > 0)).any())
             patches[k].append(Patch(*block, share.astype(np.uint8), painted))
     numbers = np.array([views[k][0].number for k in rivals], np.int32)
-    lit = seen_at_all & (np.where(seen_at_all, lowest, 0) % HIDDEN_M >= ERASED_M)  # hidden too, or not
-    return np.where(seen_at_all, numbers[first], np.int32(-1)), lit
+    lit = _lit(place, [views[k] for k in rivals], block, first) if (lowest >= ERASED_M).any() else False
+    return np.where(seen_at_all, numbers[first], np.int32(-1)), lit & seen_at_all
 
 
 def _lowest(costs: Sequence[Array32]) -> tuple[Array32, NDArray[np.uint16]]:
@@ -242,11 +241,27 @@ def _pixel_cost(place: Ground, shot: Shot, seen: Seen, block: tuple[int, int], f
     at = _block_nodes(place, seen, *block)
     cost = upsample(seen.cost[at], place.step)
     if not (seen.quality[at] == BEST).all():
-        scale = quality_scale(shot.camera)
-        u, v = (upsample((w[at] + np.float32(0.5)) / scale - np.float32(0.5), place.step) for w in (seen.u, seen.v))
-        quality = cv2.remap(shot.quality, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[OUTSIDE])
-        cost = cost + quality_cost(np.asarray(quality, np.uint8), feather_m)
+        cost = cost + quality_cost(_pixel_quality(place, shot, seen, block, shot.quality), feather_m)
     return np.where(np.isfinite(cost), cost, np.float32(np.inf))
+
+
+def _pixel_quality(
+    place: Ground, shot: Shot, seen: Seen, block: tuple[int, int], quality: Pixels, beyond: int = OUTSIDE
+) -> Pixels:
+    """Of an image of qualities, or one like it, the values (128, 128) in a block."""
+    at, scale = _block_nodes(place, seen, *block), quality_scale(shot.camera)
+    u, v = (upsample((w[at] + np.float32(0.5)) / scale - np.float32(0.5), place.step) for w in (seen.u, seen.v))
+    found = cv2.remap(quality, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[beyond])
+    return np.asarray(found, np.uint8)
+
+
+def _lit(place: Ground, views: Sequence[tuple[Shot, Seen]], block: tuple[int, int], first: NDArray[np.uint16]) -> Mask:
+    """Pixels of a block that the laser lights in the image, by its place in views, that is shown there."""
+    lit = np.zeros(first.shape, bool)
+    for k, (shot, seen) in enumerate(views):
+        erased = np.where(shot.quality == ERASED, np.uint8(255), np.uint8(0))
+        lit |= (first == k) & (_pixel_quality(place, shot, seen, block, erased, 0) > 0)
+    return lit
 
 
 def _tones(
