@@ -3,16 +3,16 @@
 from collections.abc import Sequence
 
 import numpy as np
-from dask.delayed import delayed
+from dask.delayed import Delayed, delayed
 
 from ..tasks import camera as cameras
 from ..tasks import grids, pairs
 from ..tasks.grids import Grid
-from . import dense, maps, mosaics
+from . import dense, layers, maps, meshing, mosaics
 from .job import Done
 from .maps_inputs import Image, MapJob, Pair, Tile
 from .plan import batches
-from .results import Mapped, Posed, Tiles
+from .results import Mapped, Posed, TerrainLayers, Tiles
 from .session import Session, compute
 from .solve import Solution
 
@@ -50,12 +50,14 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     usual = grids.bathymetry_cell_m(gsd)
     linked, agreed = _dense(state, m._replace(cell_m=min(cell, usual)), posed, images, outlines, ranges)
     surface_tiles = _surface(state, m, linked, agreed, images, outlines)
+    terrain = _layers(state, m, surface_tiles)
     below = m._replace(cell_m=usual)
     ground = surface_tiles if below == m else _surface(state, below, linked, agreed, images, outlines)
     textured = [image for image in images if image.texture]
     light = _lighting(state, below, textured)
     mosaic = _mosaics(state, below, textured or images, outlines, ground, mosaic_cell, light, posed)
-    return Mapped(m, cell, mosaic_cell, surface_tiles, mosaic, outlines)
+    pyramid = _mesh(state, m, textured, outlines, surface_tiles, mosaic, light)
+    return Mapped(m, cell, mosaic_cell, surface_tiles, terrain, mosaic, pyramid, outlines)
 
 
 def _images(state: Session, posed: Posed, ranges: np.ndarray) -> list[Image]:
@@ -224,6 +226,32 @@ def _around(tile: Grid, halo: int, tiles: Sequence[Grid], cells: Sequence[Done])
     return [(other, done) for other, done in zip(tiles, cells, strict=True) if grids.intersection(wide, other)]
 
 
+def _layers(state: Session, m: MapJob, surface: Tiles) -> TerrainLayers:
+    """Habitat layers of each tile, then its contours, whose interval is one for the whole map."""
+    halo = layers.reach(state.job.parameters.terrain, m.cell_m)
+    for step in (layers.TERRAIN, layers.CONTOURS):
+        state.ledger.begin(step)
+
+    def near(grid: Grid) -> list[tuple[Grid, Done]]:
+        return [(tile, done) for tile, done in surface.tiles if grids.intersection(grid, tile)]
+
+    tasks = [
+        delayed(layers.terrain_tile)(m, tile, near(grids.pad(tile, halo)), dask_key_name=f"terrain-{k}")
+        for k, (tile, _) in enumerate(surface.tiles)
+    ]
+    made: list[Done] = compute(state, layers.TERRAIN, tasks)
+    interval = layers.contour_interval_m(made)
+    tasks = [
+        delayed(layers.contour_tile)(m, tile, near(layers.contour_grid(tile)), interval, dask_key_name=f"contours-{k}")
+        for k, (tile, _) in enumerate(surface.tiles)
+    ]
+    lines: list[Done] = compute(state, layers.CONTOURS, tasks)
+    for step, done in ((layers.TERRAIN, made), (layers.CONTOURS, lines)):
+        state.ledger.end(step, done)
+    tiles = tuple((tile, done) for (tile, _), done in zip(surface.tiles, made, strict=True))
+    return TerrainLayers(Tiles(surface.grid, tiles), tuple(lines), interval)
+
+
 def _lighting(state: Session, m: MapJob, images: Sequence[Image]) -> Done | None:
     if state.job.parameters.mosaic.colour == "none" or not images:
         return None
@@ -264,6 +292,39 @@ def _mosaics(
     for step, results in ((mosaics.ALIGN, [aligned]), (mosaics.MOSAIC, done)):
         state.ledger.end(step, results)
     return Tiles(grid, tuple(zip(tiles, done, strict=True)))
+
+
+def _mesh(
+    state: Session,
+    m: MapJob,
+    images: Sequence[Image],
+    outlines: np.ndarray,
+    ground: Tiles,
+    mosaic: Tiles,
+    light: Done | None,
+) -> dict[meshing.Place, Done]:
+    """The pyramid of mesh tiles, each level from the one below."""
+    state.ledger.begin(meshing.MESH)
+    margin, cell = _margin(outlines, images), mosaic.grid.cell_m
+    finest, *coarser = meshing.levels(list(meshing.leaves(ground.grid)))
+    tasks: dict[meshing.Place, Delayed] = {}
+    for place in finest:
+        own, around, texture = meshing.leaf_inputs(m, place, cell)
+        near = [(tile, done) for tile, done in ground.tiles if grids.intersection(around, tile)]
+        pictures = [(tile, done) for tile, done in mosaic.tiles if grids.intersection(texture, tile)]
+        shown = _touching(outlines, images, own, margin)
+        given = (m, place, shown, near, pictures, light, cell)
+        tasks[place] = delayed(meshing.leaf)(*given, dask_key_name=f"mesh-{'-'.join(map(str, place))}")
+    below = finest
+    for level in coarser:
+        for place in level:
+            children = [(child, tasks[child]) for child in below if child.parent == place]
+            name = f"mesh-{'-'.join(map(str, place))}"
+            tasks[place] = delayed(meshing.parent)(m, place, children, dask_key_name=name)
+        below = level
+    made: list[Done] = compute(state, meshing.MESH, list(tasks.values()))
+    state.ledger.end(meshing.MESH, made)
+    return dict(zip(tasks, made, strict=True))
 
 
 def range_of(done: Done | None, fallback: float) -> float:

@@ -18,11 +18,14 @@ from ..schemas.products import (
     NavigationDifference,
     PairQuality,
     Quality,
+    RingScale,
     SoundingQuality,
     SourceShares,
+    TerrainQuality,
     TrajectoryQuality,
 )
-from . import calibration_quality, residual_quality
+from ..tasks.derivatives import Ring
+from . import calibration_quality, layers, residual_quality
 from .results import Results, span, vertical_reference
 
 
@@ -66,6 +69,7 @@ def figures(
             }
         ),
         bathymetry=_bathymetry_quality(folder, results.mapped.cell_m),
+        terrain=_terrain_quality(results, folder),
         mosaic=_mosaic_quality(results),
         mesh=triangles,
         warnings=(
@@ -174,9 +178,43 @@ def _bathymetry_quality(folder: Path, cell_m: float) -> BathymetryQuality:
     )
 
 
+def _terrain_quality(results: Results, folder: Path) -> TerrainQuality:
+    cell = results.mapped.cell_m
+    fine, broad = layers.rings(results.job.parameters.terrain, cell)
+    slope, vrm, rugosity, roughness = (
+        rasters.summarise(folder / f"terrain/{name}.tif").median for name in ("slope", "vrm", "rugosity", "roughness")
+    )
+    return TerrainQuality(
+        slope_deg=slope,
+        vrm=vrm,
+        rugosity=rugosity,
+        roughness_m=roughness,
+        bpi_fine=ring_scale(fine, cell),
+        bpi_broad=ring_scale(broad, cell),
+        contour_interval_m=results.mapped.terrain.interval_m,
+    )
+
+
+def ring_scale(ring: Ring, cell_m: float) -> RingScale:
+    """A ring in cells and in metres."""
+    inner, outer = ring
+    return RingScale(inner_cells=inner, outer_cells=outer, inner_m=inner * cell_m, outer_m=outer * cell_m)
+
+
+def ring_text(scale: RingScale) -> str:
+    """A ring's scale in words."""
+    return f"{scale.inner_cells} to {scale.outer_cells} cells, {scale.inner_m:g} to {scale.outer_m:g} m"
+
+
 def _mosaic_quality(results: Results) -> MosaicQuality:
     cell = results.mapped.mosaic_cell_m
     pixels = sum(done.info["pixels"] for _, done in results.mapped.mosaic.tiles)
     surface = sum(done.info["cells"] for _, done in results.mapped.surface.tiles) * results.mapped.cell_m**2
     area = pixels * cell**2
-    return MosaicQuality(cell_m=cell, area_m2=area, coverage_share=min(1.0, area / surface) if surface else None)
+    painted = sum(done.info["painted"] for _, done in results.mapped.mosaic.tiles)
+    return MosaicQuality(
+        cell_m=cell,
+        area_m2=area,
+        coverage_share=min(1.0, area / surface) if surface else None,
+        painted_share=painted / pixels if pixels else None,
+    )

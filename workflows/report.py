@@ -20,6 +20,7 @@ from ..catalog import rasters, trajectories
 from ..schemas.products import PRODUCTS, NavigationDifference, Quality
 from ..schemas.provenance import Provenance
 from . import report_figures as figures
+from .quality import ring_text
 
 _REJECTED_SHOWN: Final = 200
 _WORST_SHOWN: Final = 10
@@ -251,7 +252,15 @@ def _bathymetry_figures(quality: Quality) -> Iterator[KeyFigure]:
 
 
 def _other_figures(quality: Quality) -> Iterator[KeyFigure]:
-    mosaic, mesh = quality.mosaic, quality.mesh
+    mosaic, mesh, terrain = quality.mosaic, quality.mesh, quality.terrain
+    if terrain is not None and terrain.slope_deg is not None:
+        rugosity = "" if terrain.rugosity is None else f"; its surface is {terrain.rugosity:.3f} of its map"
+        yield KeyFigure("Slope", f"{terrain.slope_deg:.1f}°", f"of a typical cell{rugosity}")
+        yield KeyFigure(
+            "Position indices",
+            f"{ring_text(terrain.bpi_fine)} / {ring_text(terrain.bpi_broad)}",
+            f"rings of bpi-fine and bpi-broad; contours every {_length(terrain.contour_interval_m)}",
+        )
     if mosaic is not None:
         share = "" if mosaic.coverage_share is None else f"; covers {mosaic.coverage_share:.0%} of the mapped area"
         yield KeyFigure("Mosaic", f"{mosaic.area_m2:,.1f} m²", f"pixels of {_length(mosaic.cell_m)}{share}")
@@ -280,6 +289,7 @@ def _pictures(
     )
     yield from _mosaics(root, geographic)
     yield from _layers(root, geographic)
+    yield from _terrain(root, geographic)
     soundings = root / "soundings.laz"
     yield _picture(
         "Precision of soundings",
@@ -340,6 +350,18 @@ def _layers(root: Path, geographic: bool) -> Iterator[Picture]:
         "Soundings in each cell; cells without are left white.",
         wide=False,
     )
+
+
+def _terrain(root: Path, geographic: bool) -> Iterator[Picture]:
+    shown = {
+        "slope": ("Slope", "slope (degrees)", "Steepest slope of each cell."),
+        "bpi-broad": ("Position", "height above ring (m)", "Bathymetric position index, wide ring: crests, hollows."),
+        "vrm": ("Ruggedness", "VRM", "Vector ruggedness: 0 where the ground is plane, whatever its slope."),
+    }
+    for name, (title, label, caption) in shown.items():
+        overview = _overview(root / f"terrain/{name}.tif")
+        figure = figures.quantity_map(overview, geographic, label) if overview is not None else None
+        yield _picture(title, figure, caption, wide=False)
 
 
 def _picture(title: str, figure: Figure | None, caption: str, wide: bool = True, kind: str = "png") -> Picture:

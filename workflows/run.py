@@ -17,7 +17,7 @@ from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.products import Quality
 from ..schemas.provenance import Step
-from . import dense, extract, mapping, maps, match, mosaics, plan, products, solve
+from . import dense, extract, layers, mapping, maps, match, meshing, mosaics, plan, products, solve
 from .executor import open_executor
 from .job import Done, Job, load, log
 from .plan import Plan
@@ -86,7 +86,9 @@ _VERSIONS = {
     solve.STEP: solve.VERSION,
     **dense.VERSIONS,
     **maps.VERSIONS,
+    **layers.VERSIONS,
     **mosaics.VERSIONS,
+    **meshing.VERSIONS,
 }
 
 
