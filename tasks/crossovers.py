@@ -104,7 +104,7 @@ def _nodes(image: int, X: Array, arm: Array) -> tuple[Indices, Indices, Array, A
 def find(poses: Poses, made: Lines) -> Crossovers:
     """Where the lines cross with the poses as they are; sigma is what the nodes around a crossing say."""
     known = poses.known[made.image]
-    image, arm, X_camera, node_sigma = (column[known] for column in made[:4])
+    image, arm, X_camera, node_sigma = made.image[known], made.arm[known], made.X_camera[known], made.sigma_m[known]
     X = np.einsum("pij,pj->pi", poses.R_local_camera[image], X_camera) + poses.C_local[image]
     found = crossings(Points(X[:, :2], image, arm.astype(np.int8), node_sigma), X, made.longest_m)
     p, q, f, g = found

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .gridding import MATCHING, Cells
 from .grids import Grid, cell_centres
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 _RADII = (1, 2, 4)  # cells

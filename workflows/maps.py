@@ -152,7 +152,7 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
 
 def _hold_out(m: MapJob, sample: Sample, halo: Grid, cells: Cells) -> surface.Holdout:
     inner = grids.window(halo, sample.tile)
-    return surface.hold_out(sample.tile, Cells(*(values[inner] for values in cells)), m.max_interpolation_m)
+    return surface.hold_out(sample.tile, Cells._make(values[inner] for values in cells), m.max_interpolation_m)
 
 
 def _halo(m: MapJob, tile: Grid) -> Grid:

@@ -53,7 +53,7 @@ def pairs(names: Sequence[str], solution: Solution) -> Iterator[PairResidual]:
     for i, j in sorted({*seen, *crossed}):
         s, c = seen.get((i, j)), crossed.get((i, j))
         yield PairResidual(
-            images=(names[i], names[j]),
+            images=(names[int(i)], names[int(j)]),
             tie_points=0 if s is None else int(left.shared[s]),
             reprojection_px=None if s is None else round(float(left.pair_px[s]), 4),
             crossovers=0 if c is None else int(left.crossings[c]),

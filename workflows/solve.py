@@ -107,7 +107,7 @@ def solution(entry: Entry) -> Solution:
     arrays = entry.arrays
     poses = Poses(arrays["R"], arrays["C"])
     status, turned = entry.info["status"], arrays["turned"]
-    left = [arrays.get(f"left_{name}") for name in Residuals._fields]
+    left = [arrays[f"left_{name}"] for name in Residuals._fields if f"left_{name}" in arrays]
     return Solution(
         poses,
         arrays["sigma_m"],
@@ -116,5 +116,5 @@ def solution(entry: Entry) -> Solution:
         arrays["pairs"],
         turned,
         entry.info["reprojection_px"],
-        None if left[0] is None else Residuals(*left),
+        Residuals(*left) if left else None,
     )
