@@ -43,7 +43,8 @@ SetOption = Annotated[
 def run(
     mission: MissionArgument,
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="OUT", help="Products go to OUT/<mission id>/v1, v2, ...")
+        str,
+        typer.Option("--out", "-o", metavar="OUT", help="Folder or s3://...; products go to OUT/<mission id>/v1, ..."),
     ],
     params: ParamsOption = None,
     set_: SetOption = None,
@@ -115,7 +116,7 @@ def demo(out: Annotated[Path, typer.Argument(metavar="OUT", help="A new or an ea
     if not mission.exists():
         _console.print("Making a small mission over a simulated reef ...")
         simulator.simulate("demo", mission)
-    result = runner.run(str(mission), out / "products", _parameters(None, None))
+    result = runner.run(str(mission), str(out / "products"), _parameters(None, None))
     _print_result(result)
     measured = evaluator.evaluate(result.path, mission)
     _console.print("Against the simulation's truth:")

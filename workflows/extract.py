@@ -7,7 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..catalog.images import UnreadableImage, read_image
+from ..catalog.images import MissingImage, UnreadableImage, read_image
 from ..schemas.calibration import Laser
 from ..schemas.mission import Role
 from ..tasks import colour, features, laser, triangulation
@@ -50,7 +50,7 @@ def _extract(job: Job, image: ImageTask) -> Done:
 
     try:
         return once(job, STEP, VERSION, [image.sha256], parameters, make)
-    except OSError as error:  # not the image's fault, so not to be remembered: the next run tries again
+    except MissingImage as error:  # not the image's fault, so not to be remembered: the next run tries again
         return Done(STEP, "", True, 0.0, _rejected(job, image, error))
 
 
@@ -66,12 +66,14 @@ def read_verified(job: Job, path: str, sha256: str, reduce: int = 1) -> np.ndarr
     ------
     UnreadableImage
         It cannot be decoded.
-    OSError
+    MissingImage
         It cannot be read now, or it changed since.
+    ObjectStoreError
+        The object store does not give it.
     """
     decoded = read_image(job.mission_url, path, job.calibration.camera, reduce)
     if decoded.sha256 != sha256:
-        raise OSError(f"{path} changed while the mission was being processed; run again")
+        raise MissingImage(f"{path} changed while the mission was being processed; run again")
     return decoded.bgr
 
 
