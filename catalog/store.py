@@ -13,7 +13,7 @@ import time
 import zipfile
 import zlib
 from collections.abc import Collection, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from fsspec import AbstractFileSystem
@@ -21,7 +21,7 @@ from fsspec.implementations.local import LocalFileSystem
 from numpy.typing import NDArray
 
 from .filesystems import asking, connect, write_whole
-from .runs import is_dead
+from .runs import is_dead, run_name
 
 _INFO, _ARRAY, _SCRATCH = "info.json", ".npy", ".tmp"
 _UNREADABLE = (
@@ -66,7 +66,7 @@ class Store(NamedTuple):
         try:
             with asking(fs, path):
                 if names is None or not isinstance(fs, LocalFileSystem):  # at one go, as object stores like it
-                    return _unpack(io.BytesIO(fs.cat_file(path)), names)
+                    return _unpack(io.BytesIO(cast(bytes, fs.cat_file(path))), names)
                 with fs.open(path, "rb") as file:
                     return _unpack(file, names)
         except _UNREADABLE:
@@ -88,14 +88,35 @@ class Store(NamedTuple):
             fs.rm_file(path)
 
     def clean(self) -> None:
-        """Remove what dead runs had not finished writing."""
+        """Remove what dead runs had not finished writing, and their marks."""
         fs, folder = connect(f"{self.url}/{_SCRATCH}")
-        if not isinstance(fs, LocalFileSystem) or not fs.isdir(folder):
-            return
-        for path in fs.ls(folder, detail=False):
-            with contextlib.suppress(FileNotFoundError):  # finished meanwhile
-                if is_dead(path.rpartition("/")[2], time.time() - fs.modified(path).timestamp()):
-                    fs.rm_file(path)
+        with asking(fs, folder), contextlib.suppress(FileNotFoundError):
+            for path in fs.ls(folder, detail=False):
+                with contextlib.suppress(FileNotFoundError):  # finished meanwhile
+                    if is_dead(path.rpartition("/")[2], time.time() - fs.modified(path).timestamp()):
+                        fs.rm_file(path)
+
+    def mark(self) -> str:
+        """Leave a mark by which other processes tell that they see the same store; its name."""
+        name = run_name()
+        write_whole(self._mark(name), name.encode(), f"{self.url}/{_SCRATCH}")
+        return name
+
+    def is_marked(self, name: str) -> bool:
+        fs, path = connect(self._mark(name))
+        try:
+            with asking(fs, path):
+                return fs.cat_file(path) == name.encode()
+        except OSError:
+            return False
+
+    def unmark(self, name: str) -> None:
+        fs, path = connect(self._mark(name))
+        with asking(fs, path), contextlib.suppress(FileNotFoundError):
+            fs.rm_file(path)
+
+    def _mark(self, name: str) -> str:
+        return f"{self.url}/{_SCRATCH}/{name}"
 
     def put(
         self,

@@ -97,7 +97,7 @@ class VersionWriter:
     def _rename(self, folder: Path) -> Path:
         newest = newest_version(self._out, self._mission)
         if newest is not None and newest.digest == self._digest:
-            return Path(newest.path)
+            return Path(str(newest.path))
         number = newest.number + 1 if newest else 1
         while True:
             path = folder / f"v{number}"
