@@ -130,12 +130,12 @@ def load(job: Job, step: str, key: str, names: Collection[str] | None = None) ->
     Raises
     ------
     LostEntry
-        If it is gone or damaged; a rerun makes it again.
+        If it is gone or damaged; then it is forgotten, so that going over the steps again makes it anew.
     """
     entry = job.store.get(step, key, names)
     if entry is None:
         job.store.remove(step, key)
-        raise LostEntry(f"{job.store.path(step, key)} is gone or damaged; run again to make it anew")
+        raise LostEntry(f"{job.store.path(step, key)} is gone or damaged and has to be made anew")
     return entry
 
 

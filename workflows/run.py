@@ -11,7 +11,7 @@ import numpy as np
 from dask.delayed import Delayed, delayed
 
 from ..catalog.digests import recall, remember
-from ..catalog.filesystems import Folder, is_remote, place
+from ..catalog.filesystems import Folder, ObjectStoreError, is_remote, place
 from ..catalog.mission_files import no_access
 from ..catalog.mission_inputs import MISSION
 from ..catalog.missions import OpenedMission, open_mission
@@ -32,8 +32,6 @@ from .session import Ledger, Session, compute
 _IMAGES_A_BATCH = 4
 _PAIRS_A_BATCH = 16
 _LOOP_ROUNDS = 3
-# how often a result that was found damaged is made anew before the disk is to blame
-_REPAIRS = 5
 
 
 class RunResult(NamedTuple):
@@ -86,15 +84,15 @@ def run(
     with _footing(store, opened, out) as footing, open_executor(scheduler, workers, cluster) as executor:
         job = Job(mission_url, opened.mission.id, store, opened.calibration, parameters, footing)
         executor.check(job)
-        made = plan.plan(opened, parameters)
-        for left in reversed(range(_REPAIRS + 1)):
+        made, lost = plan.plan(opened, parameters), set()
+        while True:
             try:
                 return _process(Session(job, opened, made, executor, Ledger(), uuid4().hex[:8]), out)
             except LostEntry as error:
-                if not left:
+                if str(error) in lost:  # made anew and damaged again: the disk is to blame
                     raise
-                log.warning("mission=%s step=%s %s; making it anew", job.mission_id, "repair", error)
-    raise AssertionError("unreachable")
+                lost.add(str(error))
+                log.warning("mission=%s step=%s %s", job.mission_id, "repair", error)
 
 
 def _process(state: Session, out: str) -> RunResult:
@@ -112,16 +110,22 @@ def _absolute(url: str | Path) -> str:
 @contextmanager
 def _footing(store: Store, opened: OpenedMission, out: str) -> Iterator[Footing]:
     """The run's mark in the store, by which workers tell that they see it; leftovers of dead runs are removed."""
-    try:
+    with _reaching(out):
         store.clean()
         mark = store.mark()
-    except OSError as error:
-        raise InvalidInput([no_access(out, error, "a folder that can be written")]) from error
     try:
         yield Footing(software(), opened.input_digests[MISSION], mark)
     finally:
         with suppress(OSError):
             store.unmark(mark)
+
+
+@contextmanager
+def _reaching(out: str) -> Iterator[None]:
+    try:
+        yield
+    except (PermissionError, FileNotFoundError, ObjectStoreError) as error:
+        raise InvalidInput([no_access(out, error, "a folder that can be written")]) from error
 
 
 _VERSIONS = {
@@ -136,14 +140,13 @@ _VERSIONS = {
 
 def _open(mission_url: str, out: str) -> OpenedMission:
     """Open a mission, remembering the images' digests between runs."""
-    try:
+    with _reaching(out):
         known = recall(out, mission_url)
-        before = len(known)
-        opened = open_mission(mission_url, known)
-        if len(known) != before:
+    before = len(known)
+    opened = open_mission(mission_url, known)
+    if len(known) != before:
+        with _reaching(out):
             remember(out, mission_url, known)
-    except PermissionError as error:
-        raise InvalidInput([no_access(out, error, "a folder that can be written")]) from error
     return opened
 
 
