@@ -81,16 +81,18 @@ def publish(made: Path, folder: UPath, digest: str) -> UPath:
     """
     claim = _Claim(digest, run_name())
     while True:
+        with asking(folder.fs, str(folder)):
+            claims = _numbers(folder / _CLAIMS)  # before the versions: one that ends meanwhile is among these
         known = sorted(finished(folder))
         if known and digest_of(folder / f"v{known[-1]}") == digest:
             return folder / f"v{known[-1]}"
-        with asking(folder.fs, str(folder)):
-            claims = _numbers(folder / _CLAIMS)
         if any(_is_at_work(folder, number, digest) for number in claims if number not in known):
             continue
         number = max([0, *known, *claims]) + 1
         if create(folder.fs, _path(folder, number), claim.bytes()):
-            break
+            if not _is_whole(folder / f"v{number}"):
+                break
+            _remove(folder, number)  # of another run that began and ended since we looked
     with _kept(folder, number, claim) as check:
         _upload(made, folder / f"v{number}", check)
     return folder / f"v{number}"

@@ -19,17 +19,6 @@ from tests.products import differing
 
 
 @pytest.fixture(scope="module")
-def s3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[S3]:
-    with fleet.s3_server(tmp_path_factory.mktemp("s3")) as server, pytest.MonkeyPatch.context() as patch:
-        for name, value in server.env.items():
-            patch.setenv(name, value)
-        s3fs.S3FileSystem.clear_instance_cache()
-        s3fs.S3FileSystem().mkdir(server.bucket)
-        yield server
-        s3fs.S3FileSystem.clear_instance_cache()
-
-
-@pytest.fixture(scope="module")
 def workers(s3: S3, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Two workers, each in a folder of its own; the scheduler's address."""
     folder = tmp_path_factory.mktemp("workers")
@@ -77,7 +66,7 @@ def test_workers_that_do_not_see_the_same_are_refused(tiny_mission, s3, workers,
         assert len(caught.value.problems) == 2
     ours = (("seamosaic", "0123"), *footing.software()[1:])
     monkeypatch.setattr(runner, "software", lambda: ours)
-    with pytest.raises(InvalidInput, match="seamosaic is .* here, 0123 there"):
+    with pytest.raises(InvalidInput, match=r"seamosaic is .* here, 0123 there"):
         run(remote, s3.url("maps"), Parameters(), scheduler=workers)
 
 
