@@ -3,14 +3,13 @@
 import os
 from typing import Any
 
-from distributed import LocalCluster, Status
+from distributed import LocalCluster
 from distributed.deploy.cluster import Cluster as Running
 
 from ..schemas.cluster import Cluster
 from ..schemas.problems import InvalidInput, Problem
 
 _FREE_PORT = ":0"
-_ENDED = (Status.stopped, Status.closed, Status.failed)
 
 
 def start(described: Cluster) -> Running:
@@ -29,19 +28,16 @@ def start(described: Cluster) -> Running:
     return cluster
 
 
-def is_dead(nanny: Any) -> bool:
-    """Whether a worker of this machine is gone for good: its nanny starts none that was killed while it started."""
-    process = getattr(nanny, "process", None)
-    return nanny.status in _ENDED or process is None or process.status in _ENDED
-
-
 def replace_dead(cluster: Running, wanted: int, before: frozenset) -> frozenset:
-    """Start new workers for those of this machine that are gone for good, now and before; names of those gone now."""
-    dead = frozenset(name for name, nanny in list(cluster.workers.items()) if is_dead(nanny))
-    gone = len(dead & before)
-    if gone and len(cluster.worker_spec) < wanted + gone:
-        cluster.scale(wanted + gone)
-    return dead
+    """Start the workers of this machine that are missing now and were before; names of those to be missed next time.
+
+    A nanny starts its worker again, but gives up if that is killed while it starts, and nobody takes its place.
+    """
+    missing = frozenset(cluster.worker_spec) - frozenset(cluster.workers)
+    if missing & before:
+        cluster.scale(wanted)  # which looks at what is there
+        return frozenset()  # they take a while to start
+    return missing
 
 
 def local(workers: int | None) -> Cluster:

@@ -186,7 +186,7 @@ def _watched(client: Client, own: LocalCluster | None = None, wanted: int = 0) -
                     dead = clusters.replace_dead(own, wanted, dead)
                 missed = 0 if client.scheduler_info(n_workers=-1)["workers"] else missed + 1
                 if missed and missed % _REMIND == 0:
-                    log.warning("step=%s there is none; waiting", "workers")
+                    log.warning("step=%s there is no worker; waiting for one", "cluster")
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()

@@ -61,6 +61,7 @@ def test_a_local_cluster_has_its_workers(tmp_path):
     assert list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_worker_killed_while_it_starts_again_is_replaced(monkeypatch):
     """Its nanny starts no third one: the run would wait for ever."""
     monkeypatch.setattr(executor, "_LOOK_S", 0.2)
