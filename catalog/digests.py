@@ -2,12 +2,14 @@
 
 import hashlib
 import io
+import json
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, BinaryIO, NamedTuple, cast
 
 from fsspec import AbstractFileSystem
 
+from .filesystems import ObjectStoreError, asking, connect, write_whole
 from .image_headers import HEADER_BYTES, TAIL_BYTES, Header, read_header
 
 _BLOCK = 4 * 1024 * 1024
@@ -32,6 +34,29 @@ class Inspection(NamedTuple):
 def sha256(content: bytes) -> str:
     """SHA-256 of bytes, hexadecimal."""
     return hashlib.sha256(content).hexdigest()
+
+
+def recall(out: str, mission: str) -> dict[str, Any]:
+    """What earlier runs into OUT learnt of a mission's images; empty if there is none, or it cannot be read."""
+    fs, path = connect(_memory(out, mission))
+    try:
+        with asking(fs, out):
+            known = json.loads(fs.cat_file(path))
+    except ObjectStoreError:
+        raise
+    except (OSError, ValueError):
+        return {}
+    return known if isinstance(known, dict) else {}
+
+
+def remember(out: str, mission: str, known: Mapping[str, Any]) -> None:
+    """Keep what was learnt of a mission's images for the next run into OUT."""
+    write_whole(_memory(out, mission), json.dumps(known).encode(), f"{out}/.image-digests")
+
+
+def _memory(out: str, mission: str) -> str:
+    """A file for each mission: those of others are not read, and runs at once do not take turns."""
+    return f"{out}/.image-digests/{sha256(mission.encode())[:16]}.json"
 
 
 def inspect_images(
@@ -81,22 +106,26 @@ def _key(path: str, info: Mapping[str, Any]) -> str | None:
 def _inspect(fs: AbstractFileSystem, path: str) -> Inspection:
     digest, head, tail = hashlib.sha256(), b"", b""
     try:
-        with cast(BinaryIO, fs.open(path, "rb")) as file:
+        with asking(fs, path), cast(BinaryIO, fs.open(path, "rb")) as file:
             while block := file.read(_BLOCK):
                 digest.update(block)
                 head = head or block[:HEADER_BYTES]
                 tail = (tail + block)[-TAIL_BYTES:]
             return Inspection(digest.hexdigest(), read_header(head, tail, file))
+    except ObjectStoreError:
+        raise
     except OSError as error:
         return _unreadable(error)
 
 
 def _peek(fs: AbstractFileSystem, path: str) -> Inspection:
     try:
-        with cast(BinaryIO, fs.open(path, "rb")) as file:
+        with asking(fs, path), cast(BinaryIO, fs.open(path, "rb")) as file:
             head = file.read(HEADER_BYTES)
             file.seek(max(0, file.seek(0, io.SEEK_END) - TAIL_BYTES))
             return Inspection("", read_header(head, file.read(TAIL_BYTES), file))
+    except ObjectStoreError:
+        raise
     except OSError as error:
         return _unreadable(error)
 

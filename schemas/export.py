@@ -5,6 +5,7 @@ from pathlib import Path
 
 from .base import Model
 from .calibration import Calibration
+from .cluster import Cluster
 from .mission import Mission
 from .parameters import Parameters
 from .products import Quality
@@ -16,6 +17,7 @@ MODELS: dict[str, type[Model]] = {
     "mission": Mission,
     "calibration": Calibration,
     "parameters": Parameters,
+    "cluster": Cluster,
     "quality": Quality,
     "provenance": Provenance,
 }

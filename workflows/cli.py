@@ -1,6 +1,8 @@
-"""The `seamosaic` command. Exit codes: 0 done, 1 failed, 2 invalid input."""
+"""The `seamosaic` command. Exit codes: 0 done, 1 failed, 2 invalid input, 130 interrupted, 143 ended by SIGTERM."""
 
+import errno
 import json
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,12 +12,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ..schemas.problems import InvalidInput
+from ..schemas.problems import InvalidInput, Problem
 from .calibrate_commands import app as calibrate_app
 from .job import log
-from .progress import log_to_stderr
+from .progress import is_json, log_to_stderr
 
-FAILED, INVALID = 1, 2
+FAILED, INVALID, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 
 app = typer.Typer(
     name="seamosaic",
@@ -33,6 +35,11 @@ MissionArgument = Annotated[
     str, typer.Argument(metavar="MISSION", help="Mission folder, or any URL that fsspec reads.")
 ]
 ParamsOption = Annotated[Path | None, typer.Option("--params", metavar="FILE", help="YAML file of parameters.")]
+VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Log every step that is computed.")]
+JsonOption = Annotated[
+    bool,
+    typer.Option("--log-json", envvar="SEAMOSAIC_LOG_JSON", help="Log to standard error as JSON, one object a line."),
+]
 SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="One parameter, e.g. grid.cell_m=0.05; repeatable."),
@@ -43,7 +50,8 @@ SetOption = Annotated[
 def run(
     mission: MissionArgument,
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="OUT", help="Products go to OUT/<mission id>/v1, v2, ...")
+        str,
+        typer.Option("--out", "-o", metavar="OUT", help="Folder or s3://...; products go to OUT/<mission id>/v1, ..."),
     ],
     params: ParamsOption = None,
     set_: SetOption = None,
@@ -51,14 +59,20 @@ def run(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler (tcp://...), or threads or sync.")
     ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log every step that is computed.")] = False,
+    cluster: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="YAML file of a cluster to start: local, slurm or pbs.")
+    ] = None,
+    log_json: JsonOption = False,
+    verbose: VerboseOption = False,
 ) -> None:
     """Process a mission: every product of one mission folder. What was computed before is not computed again."""
     from . import run as runner
 
-    log_to_stderr(verbose)
-    result = runner.run(mission, out, _parameters(params, set_), scheduler, workers)
-    _print_result(result)
+    log_to_stderr(verbose, log_json)
+    result = runner.run(mission, out, _parameters(params, set_), scheduler, workers, _cluster(cluster, scheduler))
+    log.info("mission=%s step=%s path=%s new=%s", result.quality.mission.id, "done", str(result.path), result.new)
+    if not log_json:
+        _print_result(result)
 
 
 @app.command()
@@ -117,9 +131,9 @@ def demo(out: Annotated[Path, typer.Argument(metavar="OUT", help="A new or an ea
     if not mission.exists():
         _console.print("Making a small mission over a simulated reef ...")
         simulator.simulate("demo", mission)
-    result = runner.run(str(mission), out / "products", _parameters(None, None))
+    result = runner.run(str(mission), str(out / "products"), _parameters(None, None))
     _print_result(result)
-    measured = evaluator.evaluate(result.path, mission)
+    measured = evaluator.evaluate(str(result.path), mission)
     _console.print("Against the simulation's truth:")
     _console.print_json(json.dumps(measured))
     _console.print(Text(f"\nLook at {result.path / 'report.html'} in a browser,"))
@@ -132,17 +146,29 @@ def _overrides(images: int | None, width: int | None) -> dict[str, Any]:
 
 
 def _parameters(params: Path | None, overrides: list[str] | None):
-    from ..schemas.problems import Problem
     from ..schemas.yaml_input import load_parameters
 
-    text = None
-    if params is not None:
-        try:
-            text = params.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            problem = Problem("--params", None, "", str(error), "a YAML file of parameters", "Correct the path.")
-            raise InvalidInput([problem]) from error
+    text = None if params is None else _text(params, "--params", "a YAML file of parameters")
     return load_parameters(text, str(params), overrides or [])
+
+
+def _cluster(file: Path | None, scheduler: str | None):
+    from ..schemas.cluster import Cluster
+    from ..schemas.yaml_input import load_model
+
+    if file is None:
+        return None
+    if scheduler is not None:
+        remedy = "Leave one of the two away."
+        raise InvalidInput([Problem("--cluster", None, "", "--cluster and --scheduler", "one of them", remedy)])
+    return load_model(_text(file, "--cluster", "a YAML file of a cluster"), str(file), Cluster)
+
+
+def _text(file: Path, option: str, expected: str) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInput([Problem(option, None, "", str(error), expected, "Correct the path.")]) from error
 
 
 def _print_result(result: Any) -> None:
@@ -179,20 +205,40 @@ def _figures(quality: Any):
 
 def main() -> None:
     """Entry point: every error that a user can cause becomes a message and an exit code."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # workers are ended and leftovers removed
     try:
         app()
     except InvalidInput as error:
         from .check import print_problems
 
-        print_problems(error.problems, "invalid input", _errors)
+        if is_json():
+            for problem in error.problems:
+                log.error("step=%s %s", "invalid", problem)
+        else:
+            print_problems(error.problems, "invalid input", _errors)
         sys.exit(INVALID)
-    except KeyboardInterrupt:
-        _errors.print("Stopped. Run the same command again to go on from here.")
-        sys.exit(FAILED)
+    except SystemExit as left:
+        if left.code in (INTERRUPTED, TERMINATED):
+            _say("stopped; run the same command again to go on from here")
+        raise
     except Exception as error:  # the last resort: a message for the user, the traceback with --verbose
         log.debug("failed", exc_info=True)
-        _errors.print(Text("failed ", "red") + Text(str(error)))
+        _say(f"failed: {str(error) or type(error).__name__}{_remedy(error)}")
         sys.exit(FAILED)
+
+
+def _remedy(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "; make room, then run the same command again to go on from here"
+    return ""
+
+
+def _say(why: str) -> None:
+    """The last word, in the log where that is JSON."""
+    if is_json():
+        log.error("step=%s %s", "end", why)
+    else:
+        _errors.print(Text(why, "red"))
 
 
 if __name__ == "__main__":

@@ -133,7 +133,7 @@ def _dense(
     wanted = _wanted(state, posed, linked, outlines, ranges)
     described = [dense.DensePair(by_row[pair.i], by_row[pair.j], pair.key) for pair in wanted]
     tasks = [
-        delayed(dense.dense_batch)(m, batch, dask_key_name=f"dense-{k}")
+        delayed(dense.dense_batch)(m, batch, dask_key_name=state.key("dense", k))
         for k, batch in enumerate(batches(described, _PAIRS_A_BATCH))
     ]
     made: list[Done] = [done for part in compute(state, dense.STEP, tasks) for done in part]
@@ -147,7 +147,9 @@ def _dense(
         )
         for pair in (wanted or linked)[::every]
     ]
-    (agreed,) = compute(state, dense.AGREEMENT, [delayed(dense.agreement)(m, sampled, dask_key_name="agreement")])
+    (agreed,) = compute(
+        state, dense.AGREEMENT, [delayed(dense.agreement)(m, sampled, dask_key_name=state.key("agreement"))]
+    )
     state.ledger.end(dense.STEP, made)
     state.ledger.end(dense.AGREEMENT, [agreed])
     return [pair._replace(dense=keys.get((pair.i, pair.j), "")) for pair in linked], agreed
@@ -193,7 +195,7 @@ def _surface(
     touching = [_touching(outlines, images, tile, margin) for tile in tiles]
     cell_tasks = [
         delayed(maps.cells_tile)(
-            m, Tile(tile, seen, _of_images(linked, seen)), agreed, dask_key_name=f"cells-{m.cell_m:g}-{k}"
+            m, Tile(tile, seen, _of_images(linked, seen)), agreed, dask_key_name=state.key(f"cells-{m.cell_m:g}", k)
         )
         for k, (tile, seen) in enumerate(zip(tiles, touching, strict=True))
     ]
@@ -208,10 +210,10 @@ def _surface(
     count = max(1, _GROWTH_CELLS // (size * size))
     order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:count]
     samples = [maps.Sample(tiles[k], around[k], outlines[[image.row for image in touching[k]]]) for k in sorted(order)]
-    task = delayed(maps.fit_growth)(m, samples, dask_key_name=f"growth-{m.cell_m:g}")
+    task = delayed(maps.fit_growth)(m, samples, dask_key_name=state.key(f"growth-{m.cell_m:g}"))
     (growth,) = compute(state, maps.GROWTH, [task])
     surface_tasks = [
-        delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=f"surface-{m.cell_m:g}-{k}")
+        delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=state.key(f"surface-{m.cell_m:g}", k))
         for k, (tile, near) in enumerate(zip(tiles, around, strict=True))
     ]
     surfaces: list[Done] = compute(state, maps.SURFACE, surface_tasks)
@@ -236,13 +238,15 @@ def _layers(state: Session, m: MapJob, surface: Tiles) -> TerrainLayers:
         return [(tile, done) for tile, done in surface.tiles if grids.intersection(grid, tile)]
 
     tasks = [
-        delayed(layers.terrain_tile)(m, tile, near(grids.pad(tile, halo)), dask_key_name=f"terrain-{k}")
+        delayed(layers.terrain_tile)(m, tile, near(grids.pad(tile, halo)), dask_key_name=state.key("terrain", k))
         for k, (tile, _) in enumerate(surface.tiles)
     ]
     made: list[Done] = compute(state, layers.TERRAIN, tasks)
     interval = layers.contour_interval_m(made)
     tasks = [
-        delayed(layers.contour_tile)(m, tile, near(layers.contour_grid(tile)), interval, dask_key_name=f"contours-{k}")
+        delayed(layers.contour_tile)(
+            m, tile, near(layers.contour_grid(tile)), interval, dask_key_name=state.key("contours", k)
+        )
         for k, (tile, _) in enumerate(surface.tiles)
     ]
     lines: list[Done] = compute(state, layers.CONTOURS, tasks)
@@ -257,7 +261,7 @@ def _lighting(state: Session, m: MapJob, images: Sequence[Image]) -> Done | None
         return None
     state.ledger.begin(mosaics.LIGHTING)
     every = max(1, len(images) // _LIGHTING_IMAGES)
-    task = delayed(mosaics.lighting)(m, list(images[::every]), dask_key_name="lighting")
+    task = delayed(mosaics.lighting)(m, list(images[::every]), dask_key_name=state.key("lighting"))
     (light,) = compute(state, mosaics.LIGHTING, [task])
     state.ledger.end(mosaics.LIGHTING, [light])
     return light
@@ -279,7 +283,9 @@ def _mosaics(
     for step in (mosaics.ALIGN, mosaics.MOSAIC):
         state.ledger.begin(step)
     linked = _of_images(_linked(posed), shown)
-    (aligned,) = compute(state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name="align")])
+    (aligned,) = compute(
+        state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name=state.key("align"))]
+    )
     tiles = list(grids.tiles(grid, state.job.parameters.mosaic.tile_cells))
     margin = _margin(outlines, shown)
     tasks = []
@@ -287,7 +293,9 @@ def _mosaics(
         described = Tile(tile, _touching(outlines, shown, tile, margin))
         around = maps.ground_around(tile, ground.grid.cell_m, m.max_interpolation_m)
         near = [(t, done) for t, done in ground.tiles if grids.intersection(around, t)]
-        tasks.append(delayed(mosaics.mosaic_tile)(m, described, near, aligned, light, dask_key_name=f"mosaic-{k}"))
+        tasks.append(
+            delayed(mosaics.mosaic_tile)(m, described, near, aligned, light, dask_key_name=state.key("mosaic", k))
+        )
     done: list[Done] = compute(state, mosaics.MOSAIC, tasks)
     for step, results in ((mosaics.ALIGN, [aligned]), (mosaics.MOSAIC, done)):
         state.ledger.end(step, results)

@@ -12,6 +12,7 @@ import pyproj
 from pyproj.crs import CompoundCRS
 
 from ..catalog import meshes, metadata, netcdf, pointclouds, rasters, tiles3d, trajectories, vectors, versions
+from ..catalog.filesystems import Folder
 from ..catalog.mission_files import MissionFiles
 from ..catalog.missions import OpenedMission
 from ..catalog.store import digest
@@ -57,7 +58,7 @@ _VERSION = code_version(
 _NAMED_BY = ("image", "role", "time", "status", "sha256")
 
 
-def write(results: Results) -> tuple[Path, bool, Quality]:
+def write(results: Results) -> tuple[Folder, bool, Quality]:
     """Write the next version, unless the newest was made from the same: its folder, whether new, its figures."""
     job, mapped = results.job, results.mapped
     tiles = *mapped.surface.tiles, *mapped.terrain.layers.tiles, *mapped.mosaic.tiles
@@ -68,7 +69,7 @@ def write(results: Results) -> tuple[Path, bool, Quality]:
     inputs += [str(row) for row in zip(*(frames[name].values for name in _NAMED_BY), strict=True)]
     made_from = digest("products", _VERSION, [*inputs, *keys], job.parameters.model_dump(mode="json"))
     writer = versions.new_version(results.out, job.mission_id, made_from)
-    if isinstance(writer, Path):
+    if not isinstance(writer, versions.VersionWriter):
         return writer, False, Quality.model_validate_json((writer / "quality.json").read_text(encoding="utf-8"))
     with writer:
         figures = _write_all(results, writer.folder, made_from)

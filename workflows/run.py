@@ -1,25 +1,30 @@
 """The main job: a mission folder to maps. Images, then pairs, then poses, then map tiles, then the products."""
 
 import itertools
-import json
-import os
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
+from uuid import uuid4
 
 import numpy as np
 from dask.delayed import Delayed, delayed
 
+from ..catalog.digests import recall, remember
+from ..catalog.filesystems import Folder, ObjectStoreError, is_remote, place
+from ..catalog.mission_files import no_access
+from ..catalog.mission_inputs import MISSION
 from ..catalog.missions import OpenedMission, open_mission
 from ..catalog.store import Store
+from ..schemas.cluster import Cluster
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.products import Quality
 from ..schemas.provenance import Step
 from . import dense, extract, layers, mapping, maps, match, meshing, mosaics, plan, products, solve
 from .executor import open_executor
-from .job import Done, Job, load, log
+from .footing import Footing, software
+from .job import Done, Job, LostEntry, load, log
 from .plan import Plan
 from .results import Posed, Results
 from .session import Ledger, Session, compute
@@ -38,7 +43,7 @@ class RunResult(NamedTuple):
     quality : every figure. steps : what was computed and what was reused.
     """
 
-    path: Path
+    path: Folder
     new: bool
     quality: Quality
     steps: tuple[Step, ...]
@@ -46,38 +51,81 @@ class RunResult(NamedTuple):
 
 def run(
     mission_url: str,
-    out: Path,
+    out: str | Path,
     parameters: Parameters,
     scheduler: str | None = None,
     workers: int | None = None,
+    cluster: Cluster | None = None,
 ) -> RunResult:
     """Process a mission into OUT/<mission id>/vN.
 
     Results of steps are kept in OUT/<mission id>/steps under their digests, so a second run, or one that was
     stopped, computes only what is not there.
 
+    Parameters
+    ----------
+    mission_url, out : folders, or URLs that fsspec reads and writes.
+    scheduler, workers, cluster : where it runs; see `executor.open_executor`.
+
     Raises
     ------
     InvalidInput
-        With everything that is wrong with the mission.
+        With everything that is wrong with the mission, OUT or the cluster.
     NothingToMap
         If no image gave a sounding or a match.
     """
-    if Path(out).exists() and not Path(out).is_dir():
+    out, mission_url = _absolute(out), _absolute(mission_url)
+    if not is_remote(out) and Path(out).exists() and not Path(out).is_dir():
         remedy = "Give -o a folder, which need not exist."
-        raise InvalidInput([Problem(str(out), None, "", "a file", "a folder", remedy)])
+        raise InvalidInput([Problem(out, None, "", "a file", "a folder", remedy)])
     opened = _open(mission_url, out)
-    store = Store(str(Path(out).resolve() / opened.mission.id / "steps"))
-    url = mission_url if "://" in mission_url else str(Path(mission_url).resolve())
-    job = Job(url, opened.mission.id, store, opened.calibration, parameters)
-    log.info("mission=%s step=open images=%d", opened.mission.id, opened.frames.sizes["image"])
-    with open_executor(scheduler, workers) as executor:
-        state = Session(job, opened, plan.plan(opened, parameters), executor, Ledger())
-        posed = poses(state)
-        mapped = mapping.map_tiles(state, posed)
+    store = Store(f"{out}/{opened.mission.id}/steps")
+    log.info("mission=%s step=%s images=%d", opened.mission.id, "open", opened.frames.sizes["image"])
+    with _footing(store, opened, out) as footing, open_executor(scheduler, workers, cluster) as executor:
+        job = Job(mission_url, opened.mission.id, store, opened.calibration, parameters, footing)
+        executor.check(job)
+        made, lost = plan.plan(opened, parameters), set()
+        while True:
+            try:
+                return _process(Session(job, opened, made, executor, Ledger(), uuid4().hex[:8]), out)
+            except LostEntry as error:
+                if str(error) in lost:  # made anew and damaged again: the disk is to blame
+                    raise
+                lost.add(str(error))
+                log.warning("mission=%s step=%s %s", job.mission_id, "repair", error)
+
+
+def _process(state: Session, out: str) -> RunResult:
+    posed = poses(state)
+    mapped = mapping.map_tiles(state, posed)
     steps = state.ledger.steps(_VERSIONS)
-    path, new, quality = products.write(Results(job, opened, state.plan, Path(out), steps, posed, mapped))
+    path, new, quality = products.write(Results(state.job, state.opened, state.plan, out, steps, posed, mapped))
     return RunResult(path, new, quality, steps)
+
+
+def _absolute(url: str | Path) -> str:
+    return str(url).rstrip("/") if is_remote(url) else str(place(url).resolve())
+
+
+@contextmanager
+def _footing(store: Store, opened: OpenedMission, out: str) -> Iterator[Footing]:
+    """The run's mark in the store, by which workers tell that they see it; leftovers of dead runs are removed."""
+    with _reaching(out):
+        store.clean()
+        mark = store.mark()
+    try:
+        yield Footing(software(), opened.input_digests[MISSION], mark)
+    finally:
+        with suppress(OSError):
+            store.unmark(mark)
+
+
+@contextmanager
+def _reaching(out: str) -> Iterator[None]:
+    try:
+        yield
+    except (PermissionError, FileNotFoundError, ObjectStoreError) as error:
+        raise InvalidInput([no_access(out, error, "a folder that can be written")]) from error
 
 
 _VERSIONS = {
@@ -92,19 +140,15 @@ _VERSIONS = {
 }
 
 
-def _open(mission_url: str, out: Path) -> OpenedMission:
+def _open(mission_url: str, out: str) -> OpenedMission:
     """Open a mission, remembering the images' digests between runs."""
-    memory = Path(out) / ".image-digests.json"
-    known: dict[str, Any] = {}
-    with suppress(OSError, ValueError):
-        known = json.loads(memory.read_text())
+    with _reaching(out):
+        known = recall(out, mission_url)
     before = len(known)
     opened = open_mission(mission_url, known)
     if len(known) != before:
-        memory.parent.mkdir(parents=True, exist_ok=True)
-        temporary = memory.with_name(f"{memory.name}.{os.getpid()}")
-        temporary.write_text(json.dumps(known))
-        temporary.replace(memory)
+        with _reaching(out):
+            remember(out, mission_url, known)
     return opened
 
 
@@ -115,7 +159,7 @@ def poses(state: Session) -> Posed:
         state.ledger.begin(step)
     wanted = plan.first_pairs(made, state.opened, job.parameters)
     extracts = [
-        delayed(extract.extract_batch)(job, batch, dask_key_name=f"extract-{k}")
+        delayed(extract.extract_batch)(job, batch, dask_key_name=state.key("extract", k))
         for k, batch in enumerate(plan.batches(made.images, _IMAGES_A_BATCH))
     ]
     batch_of = {image.row: k // _IMAGES_A_BATCH for k, image in enumerate(made.images)}
@@ -123,6 +167,9 @@ def poses(state: Session) -> Posed:
     last = _adjust_task(state, matches, extracts, "adjust")
     *parts, adjusted = compute(state, "poses", [*extracts, *matches, last])
     extracted = _by_row(made, parts[: len(extracts)])
+    for image in made.images:
+        if status := extracted[image.row].info["status"]:
+            log.warning("mission=%s step=%s image=%s %s", job.mission_id, extract.STEP, image.path, status)
     matched = [pair for part in parts[len(extracts) :] for pair in part]
     adjustments = [adjusted]
     if made.prior is None:
@@ -170,7 +217,7 @@ def _match_tasks(
             [i.row for i in state.plan.images[n * _IMAGES_A_BATCH : (n + 1) * _IMAGES_A_BATCH]] for n in needed
         ]
         chosen = [extracts[n] for n in needed]
-        tasks.append(delayed(_match_batch)(state.job, batch, first_rows, chosen, dask_key_name=f"{name}-{k}"))
+        tasks.append(delayed(_match_batch)(state.job, batch, first_rows, chosen, dask_key_name=state.key(name, k)))
     return tasks
 
 
@@ -187,7 +234,7 @@ def _adjust_task(state: Session, matches: Sequence[Any], extracts: Sequence[Any]
     count, made = state.opened.frames.sizes["image"], state.plan
     rows = [image.row for image in made.images]
     given = (count, rows, list(matches), list(extracts), made.prior, made.R_first)
-    return delayed(_adjust)(state.job, *given, dask_key_name=name)
+    return delayed(_adjust)(state.job, *given, dask_key_name=state.key(name))
 
 
 def _adjust(
