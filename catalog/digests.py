@@ -46,7 +46,7 @@ def inspect_images(
         of plain values, so that it can be kept as JSON. None to read everything.
     """
     known = {} if known is None else known
-    keys = [_key(path, info) for path, info in files]
+    keys = [file_key(path, info) for path, info in files]
     unread = [i for i, key in enumerate(keys) if key is None or key not in known]
     read = dict(zip(unread, _all(_inspect, fs, [files[i][0] for i in unread]), strict=True))
     for i, inspection in read.items():
@@ -54,6 +54,11 @@ def inspect_images(
         if key is not None and inspection.sha256:
             known[key] = [inspection.sha256, list(inspection.header)]
     return [read[i] if i in read else _recall(known[str(key)]) for i, key in enumerate(keys)]
+
+
+def are_known(files: Sequence[tuple[str, Mapping[str, Any]]], known: Mapping[str, Any] | None) -> bool:
+    """Whether `inspect_images` would have to read none of these files."""
+    return all(file_key(path, info) in (known or {}) for path, info in files)
 
 
 def peek_images(fs: AbstractFileSystem, files: Sequence[tuple[str, Mapping[str, Any]]]) -> list[Inspection]:
@@ -72,8 +77,8 @@ def _recall(value: Sequence[Any]) -> Inspection:
     return Inspection(value[0], Header(*value[1]))
 
 
-def _key(path: str, info: Mapping[str, Any]) -> str | None:
-    """Path, size and time of change; None if the file system does not tell the latter."""
+def file_key(path: str, info: Mapping[str, Any]) -> str | None:
+    """Path, size and time of change of a file; None if the file system does not tell the latter."""
     modified = next((info[name] for name in _MODIFIED if info.get(name) is not None), None)
     return None if modified is None else f"{path}|{info.get('size')}|{modified}"
 

@@ -72,6 +72,13 @@ class Store(NamedTuple):
         except _UNREADABLE:
             return None
 
+    def touch(self, step: str, key: str) -> None:
+        """Note that a result was used, for `pruning`; an object store knows only when it was made."""
+        filesystem, path = fsspec.url_to_fs(self.path(step, key))
+        if isinstance(filesystem, LocalFileSystem):
+            with contextlib.suppress(OSError):
+                os.utime(path)
+
     def remove(self, step: str, key: str) -> None:
         """Forget a result, so that the next run makes it again."""
         filesystem, path = fsspec.url_to_fs(self.path(step, key))

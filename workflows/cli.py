@@ -1,4 +1,4 @@
-"""The `seamosaic` command. Exit codes: 0 done, 1 failed, 2 invalid input."""
+"""The `seamosaic` command. Exit codes: 0 done, 1 failed (of an archive: any mission), 2 invalid input."""
 
 import json
 import sys
@@ -10,7 +10,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ..schemas.problems import InvalidInput
+from ..schemas.problems import InvalidInput, Problem
+from . import archive_commands
+from .archive_commands import JsonOption, SchedulerOption, SetOption, VerboseOption, WorkersOption
 from .calibrate_commands import app as calibrate_app
 from .job import log
 from .progress import log_to_stderr
@@ -26,6 +28,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 app.add_typer(calibrate_app, name="calibrate")
+for command in (archive_commands.status, archive_commands.reprocess, archive_commands.compare, archive_commands.prune):
+    app.command()(command)
 _console = Console()
 _errors = Console(stderr=True)
 
@@ -33,32 +37,59 @@ MissionArgument = Annotated[
     str, typer.Argument(metavar="MISSION", help="Mission folder, or any URL that fsspec reads.")
 ]
 ParamsOption = Annotated[Path | None, typer.Option("--params", metavar="FILE", help="YAML file of parameters.")]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="One parameter, e.g. grid.cell_m=0.05; repeatable."),
-]
 
 
 @app.command()
 def run(
-    mission: MissionArgument,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="OUT", help="Products go to OUT/<mission id>/v1, v2, ...")
+    mission: Annotated[
+        str, typer.Argument(metavar="MISSION|ARCHIVE", help="A mission, or a folder with an archive.yaml: a path or URL.")
     ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="OUT", help="A mission's products go to OUT/<mission id>/v1, v2, ..."),
+    ] = None,
     params: ParamsOption = None,
     set_: SetOption = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one a core.")] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler (tcp://...), or threads or sync.")
-    ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log every step that is computed.")] = False,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    verbose: VerboseOption = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Process a mission: every product of one mission folder. What was computed before is not computed again."""
+    """Process a mission, or what is new or stale in an archive. What was computed before is not computed again."""
+    from ..catalog.archives import is_archive
     from . import run as runner
 
-    log_to_stderr(verbose)
+    if is_archive(mission):
+        _refuse_beside_an_archive(out, params, set_)
+        archive_commands.run(mission, workers, scheduler, verbose, as_json)
+        return
+    if out is None:
+        remedy = "Add -o OUT; an archive, which has archive.yaml, names it there."
+        raise InvalidInput([Problem("--out", None, "", "nothing", "the folder of the products", remedy)])
+    log_to_stderr(verbose, "json" if as_json else "bars")
     result = runner.run(mission, out, _parameters(params, set_), scheduler, workers)
-    _print_result(result)
+    if as_json:
+        _console.print_json(json.dumps(_summary(result)))
+    else:
+        _print_result(result)
+
+
+def _refuse_beside_an_archive(out: Path | None, params: Path | None, set_: list[str] | None) -> None:
+    for option, given in (("--out", out), ("--params", params), ("--set", set_)):
+        if given:
+            remedy = "Put it into archive.yaml; `seamosaic reprocess` gives some missions other parameters."
+            raise InvalidInput([Problem(option, None, "", str(given), "nothing, for an archive", remedy)])
+
+
+def _summary(result: Any) -> dict[str, Any]:
+    """A run for programs."""
+    return {
+        "mission": result.quality.mission.id,
+        "path": str(result.path),
+        "new": result.new,
+        "steps": [step.model_dump(mode="json") for step in result.steps],
+        "quality": result.quality.model_dump(mode="json"),
+    }
 
 
 @app.command()
@@ -130,7 +161,6 @@ def _overrides(images: int | None, width: int | None) -> dict[str, Any]:
 
 
 def _parameters(params: Path | None, overrides: list[str] | None):
-    from ..schemas.problems import Problem
     from ..schemas.yaml_input import load_parameters
 
     text = None
@@ -153,7 +183,7 @@ def _print_result(result: Any) -> None:
         table.add_column(name, justify="right")
     for step in result.steps:
         table.add_row(step.name, str(step.count_computed), str(step.count_reused), f"{step.core_seconds:.1f}")
-    _console.print(table)
+    _console.print(table if result.steps else table.title)
     figures = Table(show_header=False, box=None)
     for name, value in _figures(quality):
         figures.add_row(name, value)

@@ -12,7 +12,7 @@ import rasterio
 from pyproj.crs import CompoundCRS
 from rasterio.enums import Resampling
 
-from ..catalog import meshes, metadata, netcdf, pointclouds, rasters, trajectories, vectors, versions
+from ..catalog import memory, meshes, metadata, netcdf, pointclouds, rasters, trajectories, vectors, versions
 from ..catalog.mission_files import MissionFiles
 from ..catalog.missions import OpenedMission
 from ..catalog.store import digest
@@ -26,7 +26,7 @@ from .job import code_version, load
 from .results import Results, span, vertical_reference
 from .solve import Solution
 
-_VERSION = code_version(
+VERSION = code_version(
     sys.modules[__name__],
     report_figures,
     meshes,
@@ -42,7 +42,6 @@ _VERSION = code_version(
     calibration_quality,
 )
 _MESH_CELLS = 2_000_000
-_NAMED_BY = ("image", "role", "time", "status", "sha256")
 
 
 def write(results: Results) -> tuple[Path, bool, Quality]:
@@ -50,10 +49,8 @@ def write(results: Results) -> tuple[Path, bool, Quality]:
     job, mapped = results.job, results.mapped
     keys = [done.key for _, done in (*mapped.surface.tiles, *mapped.mosaic.tiles)]
     keys += [done.key for done in results.posed.extracted.values()] + [results.posed.adjusted.key]
-    inputs = sorted(f"{name}:{sha}" for name, sha in results.opened.input_digests.items())
-    frames = results.opened.frames
-    inputs += [str(row) for row in zip(*(frames[name].values for name in _NAMED_BY), strict=True)]
-    made_from = digest("products", _VERSION, [*inputs, *keys], job.parameters.model_dump(mode="json"))
+    inputs = memory.inputs_digest(results.opened)
+    made_from = digest("products", VERSION, [inputs, *keys], job.parameters.model_dump(mode="json"))
     writer = versions.new_version(results.out, job.mission_id, made_from)
     if isinstance(writer, Path):
         return writer, False, Quality.model_validate_json((writer / "quality.json").read_text(encoding="utf-8"))
@@ -282,6 +279,7 @@ def _provenance(results: Results, made_from: str) -> Provenance:
         inputs=dict(_inputs(results.opened)),
         parameters=resolved,
         steps=results.steps,
+        request=results.request,
     )
 
 

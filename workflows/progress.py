@@ -1,10 +1,15 @@
 """Progress of long work: bars on a terminal, one line a minute in a log."""
 
+import json
 import logging
+import math
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
+from typing import Literal
 
 from rich.console import Console
 from rich.logging import RichHandler
@@ -12,24 +17,51 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .job import log
 
+Style = Literal["bars", "lines", "json"]
+
 _LOG_EVERY_S = 60.0
+_LINE = "%(asctime)s %(levelname)s %(message)s"
+_NAMED = re.compile(r"(?:^| )([a-z_]+)=(\S+)")
 
 
-def log_to_stderr(verbose: bool) -> None:
-    """Send the log to standard error: coloured on a terminal, plain lines elsewhere; details if verbose."""
-    if sys.stderr.isatty():
+def log_to_stderr(verbose: bool, style: Style = "bars") -> None:
+    """Send the log to standard error; details if verbose.
+
+    style : bars for colours and progress bars where it is a terminal; lines for plain ones; json for one JSON object
+        a line, with what a line says as `name=value` among its keys.
+    """
+    if style == "bars" and sys.stderr.isatty():
         handler: logging.Handler = RichHandler(console=Console(stderr=True), show_path=False)
     else:
         handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        handler.setFormatter(_JsonFormatter() if style == "json" else logging.Formatter(_LINE))
     log.handlers = [handler]
     log.setLevel(logging.DEBUG if verbose else logging.INFO)
+
+
+class _JsonFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        message = record.getMessage()
+        time_utc = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+        named = {name: _plain(value) for name, value in _NAMED.findall(message)}
+        line = {**named, "time": time_utc, "level": record.levelname.lower(), "message": message}
+        if record.exc_info:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line, ensure_ascii=False)
+
+
+def _plain(value: str) -> str | float:
+    try:
+        number = float(value)
+    except ValueError:
+        return value
+    return int(number) if number.is_integer() else number if math.isfinite(number) else value
 
 
 @contextmanager
 def progress(mission: str, step: str, total: int) -> Iterator[Callable[[int], None]]:
     """A function to call with the number of tasks that ended."""
-    if sys.stderr.isatty():
+    if any(isinstance(handler, RichHandler) for handler in log.handlers):
         columns = TextColumn("{task.description:10}"), BarColumn(), MofNCompleteColumn()
         with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=Console(stderr=True)) as bars:
             bar = bars.add_task(step, total=total)

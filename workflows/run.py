@@ -1,25 +1,28 @@
 """The main job: a mission folder to maps. Images, then pairs, then poses, then map tiles, then the products."""
 
 import itertools
-import json
-import os
+import sys
+import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from dask.delayed import Delayed, delayed
 
-from ..catalog.missions import OpenedMission, open_mission
+from ..catalog import leases, memory, records
+from ..catalog.missions import OpenedMission
+from ..catalog.records import LastRun
 from ..catalog.store import Store
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.products import Quality
-from ..schemas.provenance import Step
-from . import dense, extract, mapping, maps, match, mosaics, plan, products, solve
+from ..schemas.provenance import Request, Step
+from . import dense, extract, mapping, maps, maps_inputs, match, mosaics, plan, products, request, results, solve
 from .executor import open_executor
-from .job import Done, Job, load, log
+from .job import Done, Job, code_version, load, log
 from .plan import Plan
 from .results import Posed, Results
 from .session import Ledger, Session, compute
@@ -35,13 +38,15 @@ class RunResult(NamedTuple):
     Attributes
     ----------
     path : the version's folder. new : False when an earlier version stands for the same inputs and parameters.
-    quality : every figure. steps : what was computed and what was reused.
+    quality : every figure. steps : what was computed and what was reused; none where nothing had to be looked at.
+    request : digest of what was asked for; None where an image could not be read, so that the next run looks again.
     """
 
     path: Path
     new: bool
     quality: Quality
     steps: tuple[Step, ...]
+    request: str | None = None
 
 
 def run(
@@ -50,11 +55,17 @@ def run(
     parameters: Parameters,
     scheduler: str | None = None,
     workers: int | None = None,
+    *,
+    leased: bool = False,
 ) -> RunResult:
     """Process a mission into OUT/<mission id>/vN.
 
-    Results of steps are kept in OUT/<mission id>/steps under their digests, so a second run, or one that was
-    stopped, computes only what is not there.
+    If the newest version is what would be made, nothing is done. Results of steps are kept in OUT/<mission id>/steps
+    under their digests, so a run that was stopped goes on, and other parameters compute only what depends on them.
+
+    Parameters
+    ----------
+    leased : the caller holds the mission's lease; else one is taken, beside others that run, so that nobody prunes.
 
     Raises
     ------
@@ -66,18 +77,45 @@ def run(
     if Path(out).exists() and not Path(out).is_dir():
         remedy = "Give -o a folder, which need not exist."
         raise InvalidInput([Problem(str(out), None, "", "a file", "a folder", remedy)])
-    opened = _open(mission_url, out)
-    store = Store(str(Path(out).resolve() / opened.mission.id / "steps"))
-    url = mission_url if "://" in mission_url else str(Path(mission_url).resolve())
-    job = Job(url, opened.mission.id, store, opened.calibration, parameters)
+    started, out = time.monotonic(), Path(out)
+    opened = memory.open_known(mission_url, str(out))
+    asked = request.ask(memory.inputs_digest(opened), parameters, CODE)
     log.info("mission=%s step=open images=%d", opened.mission.id, opened.frames.sizes["image"])
+    newest = request.standing(str(out), opened.mission.id, asked)
+    if newest is not None:
+        quality = Quality.model_validate_json((newest.path / "quality.json").read_text(encoding="utf-8"))
+        return RunResult(newest.path, False, quality, ())
+    with nullcontext() if leased else leases.take(str(out), opened.mission.id, shared=True):
+        result = _compute(mission_url, opened, out, parameters, asked, scheduler, workers)
+    ended = datetime.now(UTC).isoformat(timespec="seconds")
+    seconds = round(time.monotonic() - started, 1)
+    last = LastRun("done", result.request, int(result.path.name[1:]), ended, seconds)
+    records.write_last_run(str(out), opened.mission.id, last)
+    return result
+
+
+def _compute(
+    mission_url: str,
+    opened: OpenedMission,
+    out: Path,
+    parameters: Parameters,
+    asked: Request,
+    scheduler: str | None,
+    workers: int | None,
+) -> RunResult:
+    mission_id = opened.mission.id
+    store = Store(str(out.resolve() / mission_id / "steps"))
+    url = mission_url if "://" in mission_url else str(Path(mission_url).resolve())
+    job = Job(url, mission_id, store, opened.calibration, parameters)
     with open_executor(scheduler, workers) as executor:
         state = Session(job, opened, plan.plan(opened, parameters), executor, Ledger())
         posed = poses(state)
         mapped = mapping.map_tiles(state, posed)
     steps = state.ledger.steps(_VERSIONS)
-    path, new, quality = products.write(Results(job, opened, state.plan, Path(out), steps, posed, mapped))
-    return RunResult(path, new, quality, steps)
+    remembered = asked if all(done.key for done in posed.extracted.values()) else None
+    made = Results(job, opened, state.plan, out, steps, posed, mapped, remembered)
+    path, new, quality = products.write(made)
+    return RunResult(path, new, quality, steps, remembered.digest if remembered else None)
 
 
 _VERSIONS = {
@@ -88,22 +126,13 @@ _VERSIONS = {
     **maps.VERSIONS,
     **mosaics.VERSIONS,
 }
-
-
-def _open(mission_url: str, out: Path) -> OpenedMission:
-    """Open a mission, remembering the images' digests between runs."""
-    memory = Path(out) / ".image-digests.json"
-    known: dict[str, Any] = {}
-    with suppress(OSError, ValueError):
-        known = json.loads(memory.read_text())
-    before = len(known)
-    opened = open_mission(mission_url, known)
-    if len(known) != before:
-        memory.parent.mkdir(parents=True, exist_ok=True)
-        temporary = memory.with_name(f"{memory.name}.{os.getpid()}")
-        temporary.write_text(json.dumps(known))
-        temporary.replace(memory)
-    return opened
+# all that decides what a request comes to
+CODE = {
+    **_VERSIONS,
+    "products": products.VERSION,
+    "opening": request.OPENING,
+    "workflow": code_version(sys.modules[__name__], plan, mapping, maps_inputs, results),
+}
 
 
 def poses(state: Session) -> Posed:
