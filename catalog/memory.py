@@ -94,7 +94,7 @@ def _place(url: str, out: str) -> str:
 
 
 def _recall(url: str, out: str) -> _Memory:
-    found = json_files.read_json(_place(url, out))
+    found: Any = json_files.read_json(_place(url, out))
     with suppress(TypeError, KeyError):
         return _Memory(found["images"], found["state"], Look(**found["look"]))
     return _Memory({}, None, None)

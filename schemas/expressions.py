@@ -16,7 +16,18 @@ from .problems import InvalidInput, Problem, inconsistent
 # Of the mission itself, known before anything is processed
 MISSION_NAMES: Final = ("id", "title", "platform", "start", "end", "images")
 # Of its newest version; none of them is there without one
-VERSION_NAMES: Final = ("version", "created", "placed", "cells", "cell_m", "area_m2", "sigma_m", "core_s", "seconds", "warnings")
+VERSION_NAMES: Final = (
+    "version",
+    "created",
+    "placed",
+    "cells",
+    "cell_m",
+    "area_m2",
+    "sigma_m",
+    "core_s",
+    "seconds",
+    "warnings",
+)
 
 Row = Mapping[str, Any]
 

@@ -87,11 +87,3 @@ class Totals:
             "rms": float(np.sqrt((z**2).mean())),
             "share_above_2": float((size > 2).mean()),
         }
-
-
-def rotation_angle_deg(R1: Array, R2: Array) -> Array:
-    """Angle (N,) between rotations (N, 3, 3), degrees."""
-    trace = np.einsum("nij,nij->n", R1, R2)
-    skew = np.einsum("nji,njk->nik", R1, R2)
-    sine = np.linalg.norm(skew - skew.transpose(0, 2, 1), axis=(1, 2)) / np.sqrt(8)
-    return np.degrees(np.arctan2(sine, (trace - 1) / 2))

@@ -130,8 +130,8 @@ def status(archive: ArchiveArgument, where: WhereOption = None, as_json: JsonOpt
         table.add_column(name)
     for name in ("images", "cells", "sigma", "took"):
         table.add_column(name, justify="right")
-    for name in ("next run", "why"):
-        table.add_column(name, overflow="fold")
+    table.add_column("next run", no_wrap=True)
+    table.add_column("why", overflow="fold")
     for state in states:
         cells = _name(state), _version(state.version), _coloured(state.state)
         table.add_row(*cells, *_figures(state), state.would, Text(state.why))
@@ -206,7 +206,9 @@ def compare(
     else:
         _print_comparison(found)
         if out is not None:
-            _console.print(Text(f"Look at {out / 'compare.html'} in a browser and at {out / 'difference.tif'} in QGIS."))
+            _console.print(
+                Text(f"Look at {out / 'compare.html'} in a browser and at {out / 'difference.tif'} in QGIS.")
+            )
 
 
 def _print_comparison(found: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from ..catalog import leases, pruning, records, stac
@@ -22,7 +23,7 @@ from ..catalog.records import LastRun
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput
 from . import archive_states
-from .archive_states import CURRENT, FAILED, INVALID, LEFT_OUT, RUNNING, TO_DO, MissionState
+from .archive_states import CURRENT, FAILED, INVALID, RUNNING, TO_DO, MissionState
 from .job import log
 from .progress import Style, log_to_stderr
 
@@ -212,8 +213,9 @@ def _work(answers: Connection, url: str, products: str, parameters: Parameters, 
     threading.Thread(target=_end_with_parent, daemon=True).start()
     log_to_stderr(options.verbose, options.style)
     try:
-        result = runner.run(url, products, parameters, options.scheduler, options.workers, leased=True)
-        computed, reused = (sum(getattr(step, f"count_{kind}") for step in result.steps) for kind in ("computed", "reused"))
+        result = runner.run(url, Path(products), parameters, options.scheduler, options.workers, leased=True)
+        computed = sum(step.count_computed for step in result.steps)
+        reused = sum(step.count_reused for step in result.steps)
         answers.send(("done", int(result.path.name[1:]), result.new, computed, reused))
     except InvalidInput as error:
         answers.send((INVALID, "; ".join(map(str, error.problems[:3]))))

@@ -39,7 +39,7 @@ class MissionState(NamedTuple):
     why: str
     would: str
     version: int = 0
-    figures: Mapping[str, Any] = {}  # noqa: RUF012 (never changed)
+    figures: Mapping[str, Any] = {}
     parameters: Parameters | None = None
     request: str | None = None
 

@@ -42,7 +42,8 @@ ParamsOption = Annotated[Path | None, typer.Option("--params", metavar="FILE", h
 @app.command()
 def run(
     mission: Annotated[
-        str, typer.Argument(metavar="MISSION|ARCHIVE", help="A mission, or a folder with an archive.yaml: a path or URL.")
+        str,
+        typer.Argument(metavar="MISSION|ARCHIVE", help="A mission, or a folder with an archive.yaml: a path or URL."),
     ],
     out: Annotated[
         Path | None,

@@ -40,7 +40,8 @@ def ask(inputs: str, parameters: Parameters, code: Mapping[str, str]) -> Request
     code : versions of all parts of the software that decide the products, by name.
     """
     given = parameters.model_dump(mode="json")
-    return Request(digest=digest("run", "1", [inputs], [given, dict(code)]), inputs=inputs, parameters=given, code=code)
+    whole = digest("run", "1", [inputs], [given, dict(code)])
+    return Request(digest=whole, inputs=inputs, parameters=given, code=dict(code))
 
 
 def provenance(version: Version) -> dict[str, Any]:
