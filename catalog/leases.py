@@ -154,7 +154,7 @@ def _confirm(lease: Lease, folder: str, shared: bool) -> None:
     present = _all(folder)
     _refuse(present, lambda one: one.token != lease.holder.token and (not shared or one.purpose == "prune"))
     for number, one in present:
-        if one is not None and one.lapsed:
+        if one is not None and one.lapsed and one.token != lease.holder.token:
             json_files.remove(f"{folder}/{number}.json")
 
 

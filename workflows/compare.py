@@ -212,7 +212,7 @@ def _made_differently(first: Mapping[str, Any], second: Mapping[str, Any]) -> di
     return {
         "parameters": listed("parameters"),
         "software": listed("software"),
-        "code": [name for name, _, _ in differences(code[0], code[1])],
+        "code": [name for name in code[0] if name in code[1] and code[0][name] != code[1][name]],
         "inputs": {kind: {"count": len(names), "names": names[:_LISTED]} for kind, names in inputs.items()},
     }
 
