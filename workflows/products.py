@@ -26,21 +26,11 @@ from .job import code_version, load
 from .results import Results, span, vertical_reference
 from .solve import Solution
 
-VERSION = code_version(
-    sys.modules[__name__],
-    report_figures,
-    meshes,
-    metadata,
-    netcdf,
-    pointclouds,
-    rasters,
-    trajectories,
-    vectors,
-    mesh,
-    report,
-    quality,
-    calibration_quality,
+DECIDING = (
+    *(sys.modules[__name__], report_figures, meshes, metadata, netcdf, pointclouds, rasters, trajectories, vectors),
+    *(mesh, report, quality, calibration_quality),
 )
+VERSION = code_version(*DECIDING)
 _MESH_CELLS = 2_000_000
 
 

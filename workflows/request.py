@@ -15,6 +15,7 @@ from ..catalog import (
     mission_inputs,
     missions,
     records,
+    tiff_directory,
     versions,
 )
 from ..catalog.store import digest
@@ -24,11 +25,12 @@ from ..schemas.parameters import Parameters
 from ..schemas.provenance import Request
 from .job import code_version
 
-# What decides how a mission's files are read; what a file says wrong is said on opening
-OPENING = code_version(
+# what decides how a mission's files are read
+DECIDING = (
     *(coordinate_systems, digests, frames_table, image_times, interpolation, memory, mission_files, mission_inputs),
-    *(missions, csv_input, mission, navigation, timestamps, yaml_document, yaml_input),
+    *(missions, tiff_directory, csv_input, mission, navigation, timestamps, yaml_document, yaml_input),
 )
+OPENING = code_version(*DECIDING)
 
 
 def ask(inputs: str, parameters: Parameters, code: Mapping[str, str]) -> Request:

@@ -126,12 +126,13 @@ _VERSIONS = {
     **maps.VERSIONS,
     **mosaics.VERSIONS,
 }
+DECIDING = (sys.modules[__name__], plan, mapping, maps_inputs, results)
 # all that decides what a request comes to
 CODE = {
     **_VERSIONS,
     "products": products.VERSION,
     "opening": request.OPENING,
-    "workflow": code_version(sys.modules[__name__], plan, mapping, maps_inputs, results),
+    "workflow": code_version(*DECIDING),
 }
 
 

@@ -19,13 +19,13 @@ START, END = (datetime.fromisoformat(text.replace("Z", "+00:00")) for text in (E
 def make_version(products, mission_id, number, crs="EPSG:32631", left=25_000_000):
     folder = products / mission_id / f"v{number}"
     (folder / "metadata").mkdir(parents=True)
+    (folder / "trajectory.csv").write_text("image")
     if crs:
         wkt = pyproj.CRS(crs).to_wkt()
         with rasters.product_writer(folder, "bathymetry.tif", 0.02, left, 236_000_000, 60, 40, wkt) as writer:
             writer.write(0, 0, np.full((40, 60), -3.0))
         about = {"platform": "Vortex", "license": "CC-BY-4.0"}
         metadata.write_stac_item(folder, mission_id, number, "A reef", START, END, about)
-    (folder / "trajectory.csv").write_text("image")
     (folder / versions.PROVENANCE).write_text(json.dumps({"digest": str(number), "created": "2026-06-04T00:00:00Z"}))
     return folder
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from seamosaic.tasks import comparison, rotations
 from scipy.spatial.transform import Rotation
+from seamosaic.tasks import comparison, rotations
 
 
 @pytest.fixture
