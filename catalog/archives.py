@@ -5,13 +5,12 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
-import fsspec
-
 from ..schemas.archive import Archive
 from ..schemas.expressions import MISSION_NAMES, Row, compile_expression
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.yaml_input import load_model, load_parameters
+from .filesystems import asking, connect
 from .mission_inputs import MISSION
 
 ARCHIVE: Final = "archive.yaml"
@@ -40,7 +39,7 @@ class OpenedArchive(NamedTuple):
 def is_archive(url: str) -> bool:
     """Whether a folder or URL holds an archive.yaml."""
     try:
-        filesystem, path = fsspec.url_to_fs(url)
+        filesystem, path = connect(url)
         return filesystem.isfile(f"{path.rstrip('/')}/{ARCHIVE}")
     except (OSError, ValueError, ImportError):  # said better where it is opened
         return False
@@ -108,14 +107,14 @@ def _within(url: str, path: str, escaped: str = "") -> str:
 
 def _matching(pattern: str) -> list[str]:
     """Folders or URLs with a mission.yaml that match a glob."""
-    filesystem, path = fsspec.url_to_fs(pattern)
-    filesystem.invalidate_cache()
-    found = [str(one).rpartition("/")[0] for one in filesystem.glob(f"{path}/{MISSION}")]
+    filesystem, path = connect(pattern)
+    with asking(filesystem, pattern):
+        found = [str(one).rpartition("/")[0] for one in filesystem.glob(f"{path}/{MISSION}")]
     return [filesystem.unstrip_protocol(one) for one in found] if "://" in pattern else found
 
 
 def _read(url: str, asked: str) -> bytes:
-    filesystem, path = fsspec.url_to_fs(url)
+    filesystem, path = connect(url)
     try:
         content = filesystem.cat_file(path)
     except OSError as error:

@@ -8,6 +8,7 @@ from typing import Any, BinaryIO, NamedTuple, cast
 
 from fsspec import AbstractFileSystem
 
+from .filesystems import ObjectStoreError, asking
 from .image_headers import HEADER_BYTES, TAIL_BYTES, Header, read_header
 
 _BLOCK = 4 * 1024 * 1024
@@ -86,22 +87,26 @@ def file_key(path: str, info: Mapping[str, Any]) -> str | None:
 def _inspect(fs: AbstractFileSystem, path: str) -> Inspection:
     digest, head, tail = hashlib.sha256(), b"", b""
     try:
-        with cast(BinaryIO, fs.open(path, "rb")) as file:
+        with asking(fs, path), cast(BinaryIO, fs.open(path, "rb")) as file:
             while block := file.read(_BLOCK):
                 digest.update(block)
                 head = head or block[:HEADER_BYTES]
                 tail = (tail + block)[-TAIL_BYTES:]
             return Inspection(digest.hexdigest(), read_header(head, tail, file))
+    except ObjectStoreError:
+        raise
     except OSError as error:
         return _unreadable(error)
 
 
 def _peek(fs: AbstractFileSystem, path: str) -> Inspection:
     try:
-        with cast(BinaryIO, fs.open(path, "rb")) as file:
+        with asking(fs, path), cast(BinaryIO, fs.open(path, "rb")) as file:
             head = file.read(HEADER_BYTES)
             file.seek(max(0, file.seek(0, io.SEEK_END) - TAIL_BYTES))
             return Inspection("", read_header(head, file.read(TAIL_BYTES), file))
+    except ObjectStoreError:
+        raise
     except OSError as error:
         return _unreadable(error)
 

@@ -8,18 +8,28 @@ import threading
 from typing import Any
 from uuid import uuid4
 
-import fsspec
 from fsspec.implementations.local import LocalFileSystem
+
+from .filesystems import ObjectStoreError, asking, connect, create
 
 # file systems without hard links: exFAT, some network shares
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 
 
 def read_json(url: str) -> Any | None:
-    """What the file holds; None if there is none or it is damaged."""
-    filesystem, path = fsspec.url_to_fs(url)
+    """What the file holds; None if there is none or it is damaged.
+
+    Raises
+    ------
+    ObjectStoreError
+        If the store does not answer.
+    """
+    filesystem, path = connect(url)
     try:
-        return json.loads(filesystem.cat_file(path))  # type: ignore[arg-type]
+        with asking(filesystem, url):
+            return json.loads(filesystem.cat_file(path))  # type: ignore[arg-type]
+    except ObjectStoreError:
+        raise
     except (OSError, ValueError):
         return None
 
@@ -29,19 +39,22 @@ def write_json(url: str, value: Any, new: bool = False) -> None:
 
     Parameters
     ----------
-    new : only if there is none yet: of several that write at once, one succeeds.
+    new : only if there is none yet: of several that write at once, one succeeds. The value is like no one else's.
 
     Raises
     ------
     FileExistsError
         If it has to be new and is not.
     """
-    filesystem, path = fsspec.url_to_fs(url)
+    filesystem, path = connect(url)
     data = (json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
     if isinstance(filesystem, LocalFileSystem):
         _write_local(path, data, new)
-    else:  # an object is put whole; "create" is the store's conditional put
-        filesystem.pipe_file(path, data, mode="create" if new else "overwrite")
+    elif not new:  # an object is put whole
+        with asking(filesystem, url):
+            filesystem.pipe_file(path, data)
+    elif not create(filesystem, path, data):
+        raise FileExistsError(url)
 
 
 def _write_local(path: str, data: bytes, new: bool) -> None:
@@ -80,8 +93,8 @@ def _link(temporary: str, path: str, data: bytes) -> None:
 
 def remove(url: str) -> None:
     """Remove a file, if it is there; locally also its folder, if nothing else is in it."""
-    filesystem, path = fsspec.url_to_fs(url)
-    with contextlib.suppress(FileNotFoundError):
+    filesystem, path = connect(url)
+    with asking(filesystem, url), contextlib.suppress(FileNotFoundError):
         filesystem.rm_file(path)
     if isinstance(filesystem, LocalFileSystem):
         with contextlib.suppress(OSError):
@@ -90,16 +103,20 @@ def remove(url: str) -> None:
 
 def exists(url: str) -> bool:
     """Whether there is such a file."""
-    filesystem, path = fsspec.url_to_fs(url)
-    return filesystem.isfile(path)
+    filesystem, path = connect(url)
+    try:
+        with asking(filesystem, url):
+            return filesystem.info(path)["type"] == "file"
+    except (FileNotFoundError, NotADirectoryError):
+        return False
 
 
 def names(url: str) -> list[str]:
     """Names of the files and folders in a folder, sorted; none if it does not exist. Hidden ones are left out."""
-    filesystem, path = fsspec.url_to_fs(url)
-    filesystem.invalidate_cache(path)
+    filesystem, path = connect(url)
     try:
-        found = filesystem.ls(path, detail=False)
+        with asking(filesystem, url):
+            found = filesystem.ls(path, detail=False)
     except (FileNotFoundError, NotADirectoryError):
         return []
     listed = (one.rstrip("/").rpartition("/")[2] for one in found)

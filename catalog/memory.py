@@ -51,15 +51,17 @@ def inputs_digest(opened: OpenedMission) -> str:
     return digest("inputs", "1", [*texts, *map(str, rows)], None)
 
 
-def open_known(url: str, out: str) -> OpenedMission:
+def open_known(url: str, out: str, memory: "Memory | None" = None) -> OpenedMission:
     """Open a mission; images that earlier runs with this output folder read are not read again.
+
+    memory : if it was recalled before.
 
     Raises
     ------
     InvalidInput
         With everything that is wrong with the mission.
     """
-    memory, keys = _recall(url, out), _keys(url)
+    memory, keys = memory or recall(url, out), _keys(url)
     opened = open_mission(url, memory.images)
     _remember(url, out, memory, opened, keys)
     return opened
@@ -73,14 +75,14 @@ def look(url: str, out: str) -> Look:
     InvalidInput
         With everything that is wrong with the mission.
     """
-    memory, keys = _recall(url, out), _keys(url)
+    memory, keys = recall(url, out), _keys(url)
     same = memory.state is not None and memory.state == _state(keys)
     if memory.look is not None and same and _texts_same(url, memory.look.texts):
         return memory.look
     return _remember(url, out, memory, open_mission(url, memory.images, hashed=None), keys)
 
 
-class _Memory(NamedTuple):
+class Memory(NamedTuple):
     """What the file holds. images : as `open_mission` takes and adds to. state : of all files at the last look."""
 
     images: dict[str, Any]
@@ -93,11 +95,12 @@ def _place(url: str, out: str) -> str:
     return f"{out.rstrip('/')}/{FOLDER}/{hashlib.sha256(whole.encode()).hexdigest()[:24]}.json"
 
 
-def _recall(url: str, out: str) -> _Memory:
+def recall(url: str, out: str) -> Memory:
+    """What is known of a mission; nothing if there is no file, or a damaged one."""
     found: Any = json_files.read_json(_place(url, out))
     with suppress(TypeError, KeyError):
-        return _Memory(found["images"], found["state"], Look(**found["look"]))
-    return _Memory({}, None, None)
+        return Memory(found["images"], found["state"], Look(**found["look"]))
+    return Memory({}, None, None)
 
 
 def _keys(url: str) -> dict[str, str | None]:
@@ -121,7 +124,7 @@ def _texts_same(url: str, texts: Mapping[str, str]) -> bool:
     return files.digests == texts
 
 
-def _remember(url: str, out: str, memory: _Memory, opened: OpenedMission, keys: Mapping[str, str | None]) -> Look:
+def _remember(url: str, out: str, memory: Memory, opened: OpenedMission, keys: Mapping[str, str | None]) -> Look:
     mission, frames = opened.mission, opened.frames
     names, read = frames["image"].values.tolist(), bool((frames["sha256"].values != "").any())
     seen = Look(

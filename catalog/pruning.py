@@ -5,13 +5,13 @@ from contextlib import suppress
 from datetime import datetime
 from typing import Any, Final, NamedTuple
 
-import fsspec
 from fsspec import AbstractFileSystem
 
 from . import json_files, leases
+from .filesystems import asking, connect
 
 STEPS: Final = "steps"
-_LEFTOVER: Final = ".tmp"
+_SCRATCH: Final = ".tmp"  # of Store
 _MODIFIED: Final = ("mtime", "LastModified", "last_modified", "updated", "created")
 
 
@@ -45,7 +45,7 @@ def prune(out: str, keep_bytes: float, *, dry_run: bool = False, term_s: float =
     What killed runs left half-written goes first, then what was not used for longest. While a mission's results are
     removed, its lease is held; one that a run is at work on is left alone.
     """
-    filesystem, _ = fsspec.url_to_fs(out)
+    filesystem, _ = connect(out)
     entries = [entry for mission_id in json_files.names(out) for entry in _entries(filesystem, out, mission_id)]
     before = sum(entry.size for entry in entries)
     missions = {entry.mission_id for entry in entries}
@@ -64,9 +64,9 @@ def prune(out: str, keep_bytes: float, *, dry_run: bool = False, term_s: float =
 
 
 def _entries(filesystem: AbstractFileSystem, out: str, mission_id: str) -> list[Entry]:
-    _, folder = fsspec.url_to_fs(f"{out.rstrip('/')}/{mission_id}/{STEPS}")
-    filesystem.invalidate_cache(folder)
-    found: Any = filesystem.find(folder, detail=True)
+    _, folder = connect(f"{out.rstrip('/')}/{mission_id}/{STEPS}")
+    with asking(filesystem, folder):
+        found: Any = filesystem.find(folder, detail=True)
     return [Entry(mission_id, path, int(info["size"] or 0), _used_s(info)) for path, info in found.items()]
 
 
@@ -78,14 +78,18 @@ def _used_s(info: Mapping[str, Any]) -> float:
 def _choose(entries: Sequence[Entry], excess: float) -> dict[str, list[Entry]]:
     """What to remove, by mission."""
     chosen: dict[str, list[Entry]] = {}
-    for entry in sorted(entries, key=lambda entry: (not entry.path.endswith(_LEFTOVER), entry.used_s)):
-        if excess > 0 or entry.path.endswith(_LEFTOVER):
+    for entry in sorted(entries, key=lambda entry: (not _is_half(entry.path), entry.used_s)):
+        if excess > 0 or _is_half(entry.path):
             chosen.setdefault(entry.mission_id, []).append(entry)
             excess -= entry.size
     return chosen
 
 
+def _is_half(path: str) -> bool:
+    return path.split("/")[-2] == _SCRATCH
+
+
 def _remove(filesystem: AbstractFileSystem, paths: Sequence[str]) -> None:
     for path in paths:
-        with suppress(FileNotFoundError):
+        with asking(filesystem, path), suppress(FileNotFoundError):
             filesystem.rm_file(path)

@@ -6,6 +6,7 @@ from pathlib import Path
 from .archive import Archive
 from .base import Model
 from .calibration import Calibration
+from .cluster import Cluster
 from .mission import Mission
 from .parameters import Parameters
 from .products import Quality
@@ -18,6 +19,7 @@ MODELS: dict[str, type[Model]] = {
     "mission": Mission,
     "calibration": Calibration,
     "parameters": Parameters,
+    "cluster": Cluster,
     "quality": Quality,
     "provenance": Provenance,
 }

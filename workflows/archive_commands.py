@@ -1,17 +1,18 @@
 """The commands that work on archives: run, status, reprocess, compare, prune."""
 
 import json
-import signal
-import threading
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ..schemas.cluster import Cluster
 from ..schemas.problems import InvalidInput, Problem
+from . import options
+from .options import ClusterOption, JsonOption, LogJsonOption, SchedulerOption, VerboseOption, WorkersOption
 
 FAILED = 1
 _COLOURS = {
@@ -21,18 +22,6 @@ _COLOURS = {
 _console = Console()
 
 ArchiveArgument = Annotated[str, typer.Argument(metavar="ARCHIVE", help="A folder or URL with an archive.yaml.")]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="One parameter, e.g. grid.cell_m=0.05; repeatable."),
-]
-WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes; default: one a core.")]
-SchedulerOption = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler (tcp://...), or threads or sync.")
-]
-VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Log every step that is computed.")]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="For programs: one JSON document on standard output, the log as JSON lines.")
-]
 WhereOption = Annotated[
     str | None,
     typer.Option("--where", metavar="EXPR", help="Which missions, e.g. platform == 'Vortex' and start >= 2026-06-01."),
@@ -40,41 +29,36 @@ WhereOption = Annotated[
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
 
 
-def run(archive: str, workers: int | None, scheduler: str | None, verbose: bool, as_json: bool) -> None:
-    """`seamosaic run ARCHIVE`."""
-    _run(archive, None, workers, scheduler, verbose, as_json)
+class Running(NamedTuple):
+    """How missions are run, and how it is told."""
+
+    scheduler: str | None
+    workers: int | None
+    cluster: Cluster | None
+    as_json: bool
+    log_json: bool
+    verbose: bool
 
 
-def _run(
-    archive: str,
-    only: set[str] | None,
-    workers: int | None,
-    scheduler: str | None,
-    verbose: bool,
-    as_json: bool,
-) -> None:
+def run(archive: str, running: Running, only: set[str] | None = None) -> None:
+    """`seamosaic run ARCHIVE`; only some of its missions where their ids are given."""
     from ..catalog.archives import open_archive
     from . import archive_run
     from .progress import log_to_stderr
 
     opened = open_archive(archive)
-    style = "json" if as_json else "bars" if opened.config.concurrency == 1 else "lines"
-    log_to_stderr(verbose, style)
-    _stop_on_sigterm()
-    options = archive_run.Options(scheduler, workers, verbose, style)
-    summary = archive_run.run_archive(opened, options, lambda state: only is None or state.id in only)
-    if as_json:
+    bars = opened.config.concurrency == 1
+    log_to_stderr(running.verbose, running.log_json, bars)
+    given = running.scheduler, running.workers, running.cluster, running.verbose, running.log_json, bars
+    summary = archive_run.run_archive(
+        opened, archive_run.Options(*given), lambda state: only is None or state.id in only
+    )
+    if running.as_json:
         _console.print_json(json.dumps(_document(summary)))
-    else:
+    elif not running.log_json:
         _print_summary(summary)
     if summary.failed:
         raise typer.Exit(FAILED)
-
-
-def _stop_on_sigterm() -> None:
-    """What systemd sends is taken as Ctrl-C is: leases are given back."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def _document(summary: Any) -> dict[str, Any]:
@@ -169,8 +153,10 @@ def reprocess(
     where: WhereOption = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    verbose: VerboseOption = False,
+    cluster: ClusterOption = None,
     as_json: JsonOption = False,
+    log_json: LogJsonOption = False,
+    verbose: VerboseOption = False,
     dry_run: DryRunOption = False,
 ) -> None:
     """Give missions of an archive other parameters, for good, and make new versions, reusing what does not depend on
@@ -186,7 +172,8 @@ def reprocess(
         for mission_id, words in changed.items():
             _console.print(Text(f"{mission_id}: {words}"))
         return
-    _run(archive, set(changed), workers, scheduler, verbose, as_json)
+    running = Running(scheduler, workers, options.cluster(cluster, scheduler), as_json, log_json, verbose)
+    run(archive, running, set(changed))
 
 
 def compare(

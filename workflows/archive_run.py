@@ -13,19 +13,19 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from ..catalog import leases, pruning, records, stac
 from ..catalog.archives import OpenedArchive
 from ..catalog.pruning import Pruned
 from ..catalog.records import LastRun
+from ..schemas.cluster import Cluster
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput
 from . import archive_states
 from .archive_states import CURRENT, FAILED, INVALID, RUNNING, TO_DO, MissionState
 from .job import log
-from .progress import Style, log_to_stderr
+from .progress import log_to_stderr
 
 MADE: Final = "made"
 _WAIT_S: Final = 1.0
@@ -35,12 +35,14 @@ _METHOD: Final = "forkserver" if sys.platform == "linux" else "spawn"
 
 
 class Options(NamedTuple):
-    """How missions are processed: `scheduler` and `workers` as for `run.run`, and how the log is written."""
+    """How missions are processed: as for `run.run`, and how the log is written, as for `progress.log_to_stderr`."""
 
     scheduler: str | None = None
     workers: int | None = None
+    cluster: Cluster | None = None
     verbose: bool = False
-    style: Style = "lines"
+    log_json: bool = False
+    bars: bool = False
 
 
 class Outcome(NamedTuple):
@@ -89,7 +91,7 @@ def run_archive(
     states = archive_states.assess_all(archive)
     todo = [state for state in states if state.state in TO_DO and wanted(state)]
     settled = [_settled(archive, state) for state in states if state not in todo and wanted(state)]
-    log.info("archive=%s missions=%d to_do=%d", archive.url, len(states), len(todo))
+    log.info("archive=%s step=%s missions=%d to_do=%d", archive.url, "status", len(states), len(todo))
     made = _process_all(archive, todo, options)
     limit, pruned = archive.config.keep_gb, None
     if limit is not None:
@@ -155,13 +157,13 @@ class _Child:
             outcome, why = answer
             asked = archive_states.assess(self._archive, state.url, ours=True).request
             records.write_last_run(out, state.id, LastRun("failed", asked, None, _now(), seconds, why))
-            log.error("mission=%s %s: %s", state.id, outcome, why)
+            log.error("mission=%s step=%s %s", state.id, outcome, why)
             return Outcome(state.id, state.url, outcome, why, state.version, seconds=seconds)
         _, number, new, computed, reused = answer
         _publish(self._archive, state)
         why = "" if new else "nothing changed"
         done = MADE if new else CURRENT
-        log.info("mission=%s %s version=%d computed=%d reused=%d", state.id, done, number, computed, reused)
+        log.info("mission=%s step=%s version=%d computed=%d reused=%d", state.id, done, number, computed, reused)
         return Outcome(state.id, state.url, done, why, number, computed, reused, seconds)
 
 
@@ -211,9 +213,9 @@ def _work(answers: Connection, url: str, products: str, parameters: Parameters, 
     from . import run as runner
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    log_to_stderr(options.verbose, options.style)
+    log_to_stderr(options.verbose, options.log_json, options.bars)
     try:
-        result = runner.run(url, Path(products), parameters, options.scheduler, options.workers, leased=True)
+        result = runner.run(url, products, parameters, *options[:3], leased=True)
         computed = sum(step.count_computed for step in result.steps)
         reused = sum(step.count_reused for step in result.steps)
         answers.send(("done", int(result.path.name[1:]), result.new, computed, reused))

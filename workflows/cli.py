@@ -1,6 +1,10 @@
-"""The `seamosaic` command. Exit codes: 0 done, 1 failed (of an archive: any mission), 2 invalid input."""
+"""The `seamosaic` command.
+
+Exit codes: 0 done, 1 failed (of an archive: any mission), 2 invalid input, 130 interrupted, 143 ended by SIGTERM.
+"""
 
 import json
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,13 +15,22 @@ from rich.table import Table
 from rich.text import Text
 
 from ..schemas.problems import InvalidInput, Problem
-from . import archive_commands
-from .archive_commands import JsonOption, SchedulerOption, SetOption, VerboseOption, WorkersOption
+from . import archive_commands, options
 from .calibrate_commands import app as calibrate_app
 from .job import log
-from .progress import log_to_stderr
+from .options import (
+    ClusterOption,
+    JsonOption,
+    LogJsonOption,
+    ParamsOption,
+    SchedulerOption,
+    SetOption,
+    VerboseOption,
+    WorkersOption,
+)
+from .progress import is_json, log_to_stderr
 
-FAILED, INVALID = 1, 2
+FAILED, INVALID, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 
 app = typer.Typer(
     name="seamosaic",
@@ -36,46 +49,48 @@ _errors = Console(stderr=True)
 MissionArgument = Annotated[
     str, typer.Argument(metavar="MISSION", help="Mission folder, or any URL that fsspec reads.")
 ]
-ParamsOption = Annotated[Path | None, typer.Option("--params", metavar="FILE", help="YAML file of parameters.")]
 
 
 @app.command()
 def run(
     mission: Annotated[
-        str,
-        typer.Argument(metavar="MISSION|ARCHIVE", help="A mission, or a folder with an archive.yaml: a path or URL."),
+        str, typer.Argument(metavar="MISSION|ARCHIVE", help="A mission, or a folder with archive.yaml: path or URL.")
     ],
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="OUT", help="A mission's products go to OUT/<mission id>/v1, v2, ..."),
+        str | None,
+        typer.Option("--out", "-o", metavar="OUT", help="Folder or s3://...; products go to OUT/<mission id>/v1, ..."),
     ] = None,
     params: ParamsOption = None,
     set_: SetOption = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    verbose: VerboseOption = False,
+    cluster: ClusterOption = None,
     as_json: JsonOption = False,
+    log_json: LogJsonOption = False,
+    verbose: VerboseOption = False,
 ) -> None:
     """Process a mission, or what is new or stale in an archive. What was computed before is not computed again."""
     from ..catalog.archives import is_archive
     from . import run as runner
 
+    chosen = options.cluster(cluster, scheduler)
     if is_archive(mission):
         _refuse_beside_an_archive(out, params, set_)
-        archive_commands.run(mission, workers, scheduler, verbose, as_json)
+        archive_commands.run(mission, archive_commands.Running(scheduler, workers, chosen, as_json, log_json, verbose))
         return
     if out is None:
         remedy = "Add -o OUT; an archive, which has archive.yaml, names it there."
         raise InvalidInput([Problem("--out", None, "", "nothing", "the folder of the products", remedy)])
-    log_to_stderr(verbose, "json" if as_json else "bars")
-    result = runner.run(mission, out, _parameters(params, set_), scheduler, workers)
+    log_to_stderr(verbose, log_json)
+    result = runner.run(mission, out, options.parameters(params, set_), scheduler, workers, chosen)
+    log.info("mission=%s step=%s path=%s new=%s", result.quality.mission.id, "done", str(result.path), result.new)
     if as_json:
         _console.print_json(json.dumps(_summary(result)))
-    else:
+    elif not log_json:
         _print_result(result)
 
 
-def _refuse_beside_an_archive(out: Path | None, params: Path | None, set_: list[str] | None) -> None:
+def _refuse_beside_an_archive(out: str | None, params: Path | None, set_: list[str] | None) -> None:
     for option, given in (("--out", out), ("--params", params), ("--set", set_)):
         if given:
             remedy = "Put it into archive.yaml; `seamosaic reprocess` gives some missions other parameters."
@@ -98,7 +113,7 @@ def check(mission: MissionArgument, params: ParamsOption = None, set_: SetOption
     """Say everything that is wrong with a mission, and what `run` would make of it."""
     from . import check as checker
 
-    result = checker.check(mission, _parameters(params, set_))
+    result = checker.check(mission, options.parameters(params, set_))
     checker.print_check(result, _console)
     if not result.valid:
         raise typer.Exit(INVALID)
@@ -147,9 +162,9 @@ def demo(out: Annotated[Path, typer.Argument(metavar="OUT", help="A new or an ea
     if not mission.exists():
         _console.print("Making a small mission over a simulated reef ...")
         simulator.simulate("demo", mission)
-    result = runner.run(str(mission), out / "products", _parameters(None, None))
+    result = runner.run(str(mission), str(out / "products"), options.parameters(None, None))
     _print_result(result)
-    measured = evaluator.evaluate(result.path, mission)
+    measured = evaluator.evaluate(str(result.path), mission)
     _console.print("Against the simulation's truth:")
     _console.print_json(json.dumps(measured))
     _console.print(Text(f"\nLook at {result.path / 'report.html'} in a browser,"))
@@ -159,19 +174,6 @@ def demo(out: Annotated[Path, typer.Argument(metavar="OUT", help="A new or an ea
 def _overrides(images: int | None, width: int | None) -> dict[str, Any]:
     given = {"images": images, "width": width}
     return {name: value for name, value in given.items() if value is not None}
-
-
-def _parameters(params: Path | None, overrides: list[str] | None):
-    from ..schemas.yaml_input import load_parameters
-
-    text = None
-    if params is not None:
-        try:
-            text = params.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            problem = Problem("--params", None, "", str(error), "a YAML file of parameters", "Correct the path.")
-            raise InvalidInput([problem]) from error
-    return load_parameters(text, str(params), overrides or [])
 
 
 def _print_result(result: Any) -> None:
@@ -208,20 +210,34 @@ def _figures(quality: Any):
 
 def main() -> None:
     """Entry point: every error that a user can cause becomes a message and an exit code."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # workers are ended and leftovers removed
     try:
         app()
     except InvalidInput as error:
         from .check import print_problems
 
-        print_problems(error.problems, "invalid input", _errors)
+        if is_json():
+            for problem in error.problems:
+                log.error("step=%s %s", "invalid", problem)
+        else:
+            print_problems(error.problems, "invalid input", _errors)
         sys.exit(INVALID)
-    except KeyboardInterrupt:
-        _errors.print("Stopped. Run the same command again to go on from here.")
-        sys.exit(FAILED)
+    except SystemExit as left:
+        if left.code in (INTERRUPTED, TERMINATED):
+            _say("stopped; run the same command again to go on from here")
+        raise
     except Exception as error:  # the last resort: a message for the user, the traceback with --verbose
         log.debug("failed", exc_info=True)
-        _errors.print(Text("failed ", "red") + Text(str(error)))
+        _say(f"failed: {str(error) or type(error).__name__}")
         sys.exit(FAILED)
+
+
+def _say(why: str) -> None:
+    """The last word, in the log where that is JSON."""
+    if is_json():
+        log.error("step=%s %s", "end", why)
+    else:
+        _errors.print(Text(why, "red"))
 
 
 if __name__ == "__main__":

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..catalog.images import UnreadableImage, read_image
+from ..catalog.images import MissingImage, UnreadableImage, read_image
 from ..schemas.calibration import Laser
 from ..schemas.mission import Role
 from ..tasks import colour, features, laser, triangulation
-from .job import Done, Job, Made, code_version, log, once, stage
+from .job import Done, Job, Made, code_version, once, stage
 
 STEP = "extract"
 VERSION = code_version(sys.modules[__name__])
@@ -45,17 +45,16 @@ def _extract(job: Job, image: ImageTask) -> Done:
         try:
             bgr = read_verified(job, image.path, image.sha256)
         except UnreadableImage as error:
-            return Made({}, _rejected(job, image, error))
+            return Made({}, _rejected(error))
         return _measure(job, image.role, light, bgr)
 
     try:
         return once(job, STEP, VERSION, [image.sha256], parameters, make)
-    except OSError as error:  # not the image's fault, so not to be remembered: the next run tries again
-        return Done(STEP, "", True, 0.0, _rejected(job, image, error))
+    except MissingImage as error:  # not the image's fault, so not to be remembered: the next run tries again
+        return Done(STEP, "", True, 0.0, _rejected(error))
 
 
-def _rejected(job: Job, image: ImageTask, error: Exception) -> dict:
-    log.warning("mission=%s step=%s image=%s rejected: %s", job.mission_id, STEP, image.path, error)
+def _rejected(error: Exception) -> dict:
     return {"status": f"rejected: {error}", "soundings": 0, "features": 0}
 
 
@@ -66,12 +65,14 @@ def read_verified(job: Job, path: str, sha256: str, reduce: int = 1) -> np.ndarr
     ------
     UnreadableImage
         It cannot be decoded.
-    OSError
+    MissingImage
         It cannot be read now, or it changed since.
+    ObjectStoreError
+        The object store does not give it.
     """
     decoded = read_image(job.mission_url, path, job.calibration.camera, reduce)
     if decoded.sha256 != sha256:
-        raise OSError(f"{path} changed while the mission was being processed; run again")
+        raise MissingImage(f"{path} changed while the mission was being processed; run again")
     return decoded.bgr
 
 

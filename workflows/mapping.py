@@ -124,7 +124,7 @@ def _dense(
     wanted = _wanted(state, posed, linked, outlines, ranges)
     described = [dense.DensePair(by_row[pair.i], by_row[pair.j], pair.key) for pair in wanted]
     tasks = [
-        delayed(dense.dense_batch)(m, batch, dask_key_name=f"dense-{k}")
+        delayed(dense.dense_batch)(m, batch, dask_key_name=state.key("dense", k))
         for k, batch in enumerate(batches(described, _PAIRS_A_BATCH))
     ]
     made: list[Done] = [done for part in compute(state, dense.STEP, tasks) for done in part]
@@ -138,7 +138,9 @@ def _dense(
         )
         for pair in (wanted or linked)[::every]
     ]
-    (agreed,) = compute(state, dense.AGREEMENT, [delayed(dense.agreement)(m, sampled, dask_key_name="agreement")])
+    (agreed,) = compute(
+        state, dense.AGREEMENT, [delayed(dense.agreement)(m, sampled, dask_key_name=state.key("agreement"))]
+    )
     state.ledger.end(dense.STEP, made)
     state.ledger.end(dense.AGREEMENT, [agreed])
     return [pair._replace(dense=keys.get((pair.i, pair.j), "")) for pair in linked], agreed
@@ -185,7 +187,7 @@ def _surface(
     for k, tile in enumerate(tiles):
         touching = _touching(outlines, images, tile, margin)
         described = Tile(tile, touching, _of_images(linked, touching))
-        cell_tasks.append(delayed(maps.cells_tile)(m, described, agreed, dask_key_name=f"cells-{k}"))
+        cell_tasks.append(delayed(maps.cells_tile)(m, described, agreed, dask_key_name=state.key("cells", k)))
     cells: list[Done] = compute(state, maps.CELLS, cell_tasks)
     if not any(done.info["sounded"] for done in cells):
         raise NothingToMap(
@@ -194,13 +196,13 @@ def _surface(
         )
     order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:_GROWTH_TILES]
     sampled = [(tiles[k], cells[k]) for k in sorted(order)]
-    (growth,) = compute(state, maps.GROWTH, [delayed(maps.fit_growth)(m, sampled, dask_key_name="growth")])
+    (growth,) = compute(state, maps.GROWTH, [delayed(maps.fit_growth)(m, sampled, dask_key_name=state.key("growth"))])
     halo = maps.surface.halo_cells(m.max_interpolation_m, m.cell_m)
     surface_tasks = []
     for k, tile in enumerate(tiles):
         around = grids.pad(tile, halo)
         near = [(t, done) for t, done in zip(tiles, cells, strict=True) if grids.intersection(around, t)]
-        surface_tasks.append(delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=f"surface-{k}"))
+        surface_tasks.append(delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=state.key("surface", k)))
     surfaces: list[Done] = compute(state, maps.SURFACE, surface_tasks)
     for step, done in zip(steps, (cells, [growth], surfaces), strict=True):
         state.ledger.end(step, done)
@@ -212,7 +214,7 @@ def _lighting(state: Session, m: MapJob, images: Sequence[Image]) -> Done | None
         return None
     state.ledger.begin(mosaics.LIGHTING)
     every = max(1, len(images) // _LIGHTING_IMAGES)
-    task = delayed(mosaics.lighting)(m, list(images[::every]), dask_key_name="lighting")
+    task = delayed(mosaics.lighting)(m, list(images[::every]), dask_key_name=state.key("lighting"))
     (light,) = compute(state, mosaics.LIGHTING, [task])
     state.ledger.end(mosaics.LIGHTING, [light])
     return light
@@ -234,7 +236,9 @@ def _mosaics(
     for step in (mosaics.ALIGN, mosaics.MOSAIC):
         state.ledger.begin(step)
     linked = _of_images(_linked(posed), shown)
-    (aligned,) = compute(state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name="align")])
+    (aligned,) = compute(
+        state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name=state.key("align"))]
+    )
     tiles = list(grids.tiles(grid, state.job.parameters.mosaic.tile_cells))
     margin = _margin(outlines, shown)
     tasks = []
@@ -242,7 +246,9 @@ def _mosaics(
         described = Tile(tile, _touching(outlines, shown, tile, margin))
         around = maps.ground_around(tile, ground.grid.cell_m, m.max_interpolation_m)
         near = [(t, done) for t, done in ground.tiles if grids.intersection(around, t)]
-        tasks.append(delayed(mosaics.mosaic_tile)(m, described, near, aligned, light, dask_key_name=f"mosaic-{k}"))
+        tasks.append(
+            delayed(mosaics.mosaic_tile)(m, described, near, aligned, light, dask_key_name=state.key("mosaic", k))
+        )
     done: list[Done] = compute(state, mosaics.MOSAIC, tasks)
     for step, results in ((mosaics.ALIGN, [aligned]), (mosaics.MOSAIC, done)):
         state.ledger.end(step, results)

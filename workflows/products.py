@@ -13,6 +13,7 @@ from pyproj.crs import CompoundCRS
 from rasterio.enums import Resampling
 
 from ..catalog import memory, meshes, metadata, netcdf, pointclouds, rasters, trajectories, vectors, versions
+from ..catalog.filesystems import Folder
 from ..catalog.mission_files import MissionFiles
 from ..catalog.missions import OpenedMission
 from ..catalog.store import digest
@@ -34,7 +35,7 @@ VERSION = code_version(*DECIDING)
 _MESH_CELLS = 2_000_000
 
 
-def write(results: Results) -> tuple[Path, bool, Quality]:
+def write(results: Results) -> tuple[Folder, bool, Quality]:
     """Write the next version, unless the newest was made from the same: its folder, whether new, its figures."""
     job, mapped = results.job, results.mapped
     keys = [done.key for _, done in (*mapped.surface.tiles, *mapped.mosaic.tiles)]
@@ -42,7 +43,7 @@ def write(results: Results) -> tuple[Path, bool, Quality]:
     inputs = memory.inputs_digest(results.opened)
     made_from = digest("products", VERSION, [inputs, *keys], job.parameters.model_dump(mode="json"))
     writer = versions.new_version(results.out, job.mission_id, made_from)
-    if isinstance(writer, Path):
+    if not isinstance(writer, versions.VersionWriter):
         return writer, False, Quality.model_validate_json((writer / "quality.json").read_text(encoding="utf-8"))
     with writer:
         figures = _write_all(results, writer.folder, made_from)

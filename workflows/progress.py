@@ -1,15 +1,14 @@
-"""Progress of long work: bars on a terminal, one line a minute in a log."""
+"""What is said of long work: bars on a terminal, one line a minute in a log, as text or as JSON."""
 
 import json
 import logging
-import math
 import re
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Any
 
 from rich.console import Console
 from rich.logging import RichHandler
@@ -17,45 +16,50 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .job import log
 
-Style = Literal["bars", "lines", "json"]
-
 _LOG_EVERY_S = 60.0
-_LINE = "%(asctime)s %(levelname)s %(message)s"
-_NAMED = re.compile(r"(?:^| )([a-z_]+)=(\S+)")
+_FIELD = re.compile(r"(\w+)=%[-.0-9]*[a-z]")
 
 
-def log_to_stderr(verbose: bool, style: Style = "bars") -> None:
+class JsonLines(logging.Formatter):
+    """One JSON object a line: time, level, the `name=%s` fields of the message, and what else it says as `message`."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        template = str(record.msg)
+        names, args = _FIELD.findall(template), record.args if isinstance(record.args, tuple) else ()
+        named = zip(names, args, strict=False)
+        rest = _FIELD.sub("", template).strip()
+        line: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            **{name: round(value, 3) if isinstance(value, float) else value for name, value in named},
+        }
+        if rest:
+            line["message"] = rest % args[len(names) :] if len(args) > len(names) else rest
+        if record.exc_info:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str, ensure_ascii=False)
+
+
+def log_to_stderr(verbose: bool, as_json: bool = False, bars: bool = True) -> None:
     """Send the log to standard error; details if verbose.
 
-    style : bars for colours and progress bars where it is a terminal; lines for plain ones; json for one JSON object
-        a line, with what a line says as `name=value` among its keys.
+    JSON, or coloured on a terminal, with bars of progress, and plain lines elsewhere. bars : False where several
+    processes write to one terminal.
     """
-    if style == "bars" and sys.stderr.isatty():
-        handler: logging.Handler = RichHandler(console=Console(stderr=True), show_path=False)
+    handler: logging.Handler = logging.StreamHandler()
+    if as_json:
+        handler.setFormatter(JsonLines())
+    elif bars and sys.stderr.isatty():
+        handler = RichHandler(console=Console(stderr=True), show_path=False)
     else:
-        handler = logging.StreamHandler()
-        handler.setFormatter(_JsonFormatter() if style == "json" else logging.Formatter(_LINE))
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     log.handlers = [handler]
     log.setLevel(logging.DEBUG if verbose else logging.INFO)
 
 
-class _JsonFormatter(logging.Formatter):
-    def format(self, record: logging.LogRecord) -> str:
-        message = record.getMessage()
-        time_utc = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-        named = {name: _plain(value) for name, value in _NAMED.findall(message)}
-        line = {**named, "time": time_utc, "level": record.levelname.lower(), "message": message}
-        if record.exc_info:
-            line["traceback"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False)
-
-
-def _plain(value: str) -> str | float:
-    try:
-        number = float(value)
-    except ValueError:
-        return value
-    return int(number) if number.is_integer() else number if math.isfinite(number) else value
+def is_json() -> bool:
+    """Whether the log is for a program."""
+    return any(isinstance(handler.formatter, JsonLines) for handler in log.handlers)
 
 
 @contextmanager

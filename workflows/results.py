@@ -1,7 +1,6 @@
 """What the steps of a run came to, as the products are made from it."""
 
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +48,7 @@ class Results(NamedTuple):
     job: Job
     opened: OpenedMission
     plan: Plan
-    out: Path
+    out: str
     steps: tuple[Step, ...]
     posed: Posed
     mapped: Mapped

@@ -71,7 +71,7 @@ def test_a_run_that_begins_meanwhile_is_left_alone(out, monkeypatch):
 
 
 def test_what_killed_runs_left_half_written_goes_whatever_the_limit(out):
-    half = out / "reef/steps/extract/00/abc.npz.17-4.tmp"
+    half = out / "reef/steps/.tmp/host-17-0123abcd"
     half.parent.mkdir(parents=True, exist_ok=True)
     half.write_bytes(b"half")
     pruned = pruning.prune(str(out), 1e9)
