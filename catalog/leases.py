@@ -79,9 +79,9 @@ class Lease:
     def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._thread.join()
-        found = _read(self.url)
-        if found is not None and found.token == self.holder.token:
-            json_files.remove(self.url)
+        with suppress(OSError):  # what cannot be given back lapses
+            if self._is_ours():
+                json_files.remove(self.url)
 
     def _beat(self) -> None:
         term, renewed = self.holder.term_s, time.monotonic()

@@ -149,7 +149,10 @@ class _Child:
         if self.lost.is_set():
             answer = (FAILED, "another run took over its lease; see that this machine's clock is right")
         with self._held:
-            return self._settle(answer, seconds)
+            try:
+                return self._settle(answer, seconds)
+            except OSError as error:
+                return _failed(self.state, f"what became of it could not be written: {error}", seconds)
 
     def _settle(self, answer: Sequence[Any], seconds: float) -> Outcome:
         state, out = self.state, self._archive.products
@@ -157,14 +160,18 @@ class _Child:
             outcome, why = answer
             asked = archive_states.assess(self._archive, state.url, ours=True).request
             records.write_last_run(out, state.id, LastRun("failed", asked, None, _now(), seconds, why))
-            log.error("mission=%s step=%s %s", state.id, outcome, why)
-            return Outcome(state.id, state.url, outcome, why, state.version, seconds=seconds)
+            return _failed(state, why, seconds, outcome)
         _, number, new, computed, reused = answer
         _publish(self._archive, state)
         why = "" if new else "nothing changed"
         done = MADE if new else CURRENT
         log.info("mission=%s step=%s version=%d computed=%d reused=%d", state.id, done, number, computed, reused)
         return Outcome(state.id, state.url, done, why, number, computed, reused, seconds)
+
+
+def _failed(state: MissionState, why: str, seconds: float = 0.0, outcome: str = FAILED) -> Outcome:
+    log.error("mission=%s step=%s %s", state.id, outcome, why)
+    return Outcome(state.id, state.url, outcome, why, state.version, seconds=seconds)
 
 
 def _fate(code: int | None) -> str:
@@ -202,6 +209,8 @@ def _begin(archive: OpenedArchive, state: MissionState, options: Options) -> _Ch
             lease = held.enter_context(leases.take(archive.products, state.id, term_s=archive.config.lease_s))
         except leases.Busy as busy:
             return Outcome(state.id, state.url, RUNNING, str(busy), state.version)
+        except OSError as error:
+            return _failed(state, f"no lease could be taken: {error}")
         now = archive_states.assess(archive, state.url, ours=True)
         if now.state not in TO_DO:
             return _settled(archive, now)
@@ -215,7 +224,8 @@ def _work(answers: Connection, url: str, products: str, parameters: Parameters, 
     threading.Thread(target=_end_with_parent, daemon=True).start()
     log_to_stderr(options.verbose, options.log_json, options.bars)
     try:
-        result = runner.run(url, products, parameters, *options[:3], leased=True)
+        where = options.scheduler, options.workers, options.cluster
+        result = runner.run(url, products, parameters, *where, leased=True)
         computed = sum(step.count_computed for step in result.steps)
         reused = sum(step.count_reused for step in result.steps)
         answers.send(("done", int(result.path.name[1:]), result.new, computed, reused))

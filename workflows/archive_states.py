@@ -74,11 +74,17 @@ def assess(archive: OpenedArchive, url: str, ours: bool = False) -> MissionState
     ----------
     ours : its lease is held by us, so that nobody else is asked for.
     """
-    out = archive.products
     try:
-        look = memory.look(url, out)
+        look = memory.look(url, archive.products)
     except InvalidInput as error:
         return _invalid(url, "", None, error)
+    except OSError as error:  # an object store that does not answer for this one
+        return MissionState(url, "", None, INVALID, f"it cannot be read: {error}", "nothing")
+    return _assess(archive, url, look, ours)
+
+
+def _assess(archive: OpenedArchive, url: str, look: Look, ours: bool) -> MissionState:
+    out = archive.products
     if not archive.selects(_row(look)):
         return MissionState(url, look.id, look, LEFT_OUT, "archive.yaml does not select it", "nothing")
     try:

@@ -8,8 +8,10 @@ import pytest
 from seamosaic.catalog import json_files
 
 
-@pytest.fixture(params=["local", "memory"])
+@pytest.fixture(params=["local", "memory", "s3"])
 def place(request, tmp_path):
+    if request.param == "s3":
+        return request.getfixturevalue("s3").url(tmp_path.name)
     return str(tmp_path / "some/folder") if request.param == "local" else f"memory://{tmp_path.name}/folder"
 
 
@@ -29,7 +31,7 @@ def test_what_was_written_is_read(place):
 def test_of_many_at_once_one_makes_it(place):
     def write(number):
         try:
-            json_files.write_json(f"{place}/a.json", number, new=True)
+            json_files.write_json(f"{place}/a.json", number, new=True)  # each its own
         except FileExistsError:
             return None
         return number

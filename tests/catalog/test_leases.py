@@ -21,8 +21,10 @@ with leases.take(sys.argv[1], "reef", term_s=float(sys.argv[2])):
 """
 
 
-@pytest.fixture(params=["local", "memory"])
+@pytest.fixture(params=["local", "memory", "s3"])
 def out(request, tmp_path):
+    if request.param == "s3":
+        return request.getfixturevalue("s3").url(tmp_path.name)
     return str(tmp_path) if request.param == "local" else f"memory://{tmp_path.name}"
 
 

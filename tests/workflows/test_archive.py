@@ -12,10 +12,11 @@ import time
 from collections import Counter
 from pathlib import Path
 
+import fsspec
 import psutil
 import pytest
 import yaml
-from seamosaic.catalog import leases, memory, records
+from seamosaic.catalog import json_files, leases, memory, records, stac
 from seamosaic.catalog.archives import open_archive
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.workflows import cli, run
@@ -272,6 +273,24 @@ def test_a_run_that_was_killed_frees_its_missions_and_ends_its_processes(archive
     assert [(one.outcome, one.version) for one in after.missions] == [("made", 1), ("current", 1)]
     assert after.missions[0].reused > 0
     assert not list((archive / "products/.leases").rglob("*.json"))
+
+
+def test_an_archive_on_an_object_store(pair, s3):
+    """Everything is there: archive.yaml, missions, results, leases and products."""
+    url = s3.url("archive")
+    store = fsspec.filesystem("s3")
+    store.pipe_file(f"{url}/archive.yaml", b"format: 1\nmissions: ['missions/*']\n")
+    store.put(f"{pair}/missions/m00", f"{url}/missions/m00", recursive=True)
+    for expected in (("made", 1), ("current", 1)):
+        summary = run_archive(open_archive(url), SYNC)
+        assert [(one.outcome, one.version, one.why) for one in summary.missions] == [(*expected, "")]
+    assert json_files.names(f"{url}/products/{leases.FOLDER}/plane-0") == []
+    assert stac.latest(f"{url}/products", "plane-0") == 1
+    said = invoke("prune", url, "--keep-gb", 0, "--json")
+    assert json.loads(said.output)["entries"] > 10
+    assert not store.find(f"{url}/products/plane-0/steps")
+    row = json.loads(invoke("status", url, "--json").output)[0]
+    assert (row["state"], row["version"], row["placed"]) == ("current", 1, 4)
 
 
 def test_sigterm_gives_leases_back(archive):
