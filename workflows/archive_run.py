@@ -29,6 +29,7 @@ from .progress import log_to_stderr
 
 MADE: Final = "made"
 _WAIT_S: Final = 1.0
+_PATIENCE_S: Final = 30.0  # for a process that is to end, and its cluster with it
 _GIGABYTE: Final = 1e9
 # Forked from a process that has imported all there is to import: spawning takes seconds for each mission
 _METHOD: Final = "forkserver" if sys.platform == "linux" else "spawn"
@@ -107,8 +108,11 @@ def _now() -> str:
 
 def _settled(archive: OpenedArchive, state: MissionState) -> Outcome:
     """A mission that there is nothing to do for, but that a run may have ended before it was in the catalogue."""
-    if state.state == CURRENT and stac.latest(archive.products, state.id) != state.version:
-        _publish(archive, state)
+    try:
+        if state.state == CURRENT and stac.latest(archive.products, state.id) != state.version:
+            _publish(archive, state)
+    except OSError as error:
+        return _failed(state, f"the catalogue could not be written: {error}")
     return Outcome(state.id, state.url, state.state, state.why, state.version)
 
 
@@ -135,6 +139,8 @@ class _Child:
 
     def stop(self) -> None:
         self.process.terminate()
+        self.process.join(_PATIENCE_S)
+        self.process.kill()
         self.process.join()
         self._held.close()
 
@@ -192,8 +198,7 @@ def _process_all(archive: OpenedArchive, todo: Iterable[MissionState], options: 
                 (children if isinstance(begun, _Child) else outcomes).append(begun)  # type: ignore[arg-type]
             wait([child.process.sentinel for child in children], timeout=_WAIT_S)
             for child in [one for one in children if not one.process.is_alive() or one.lost.is_set()]:
-                if child.process.is_alive():
-                    child.process.terminate()
+                child.process.terminate()  # if it is alive, it has lost its lease
                 children.remove(child)
                 outcomes.append(child.outcome())
     finally:
@@ -221,6 +226,7 @@ def _work(answers: Connection, url: str, products: str, parameters: Parameters, 
     """Process one mission; the answer is ("done", version, new, computed, reused) or (failed or invalid, why)."""
     from . import run as runner
 
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # a cluster is taken down on the way
     threading.Thread(target=_end_with_parent, daemon=True).start()
     log_to_stderr(options.verbose, options.log_json, options.bars)
     try:
