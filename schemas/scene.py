@@ -137,6 +137,10 @@ class Scene(Model):
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$")]
     images: Annotated[int, Field(ge=1, le=10_000, description="exposures in all, both of each pair counted")] = 36
     width: Annotated[int, Field(ge=64, le=8192, description="pixels; the height is three quarters of it")] = 1216
+    period_m: Annotated[
+        float,
+        Field(ge=0, le=100, description="seabed and motion repeat themselves north and east, images too; 0: never"),
+    ] = 0.0
     terrain: TerrainScene = TerrainScene()
     texture: TextureScene = TextureScene()
     camera: CameraScene = CameraScene()
@@ -159,9 +163,20 @@ class Scene(Model):
             raise ValueError(f"survey.roles is {self.survey.roles} but laser.enabled is false")
         if self.survey.highest_m >= self.terrain.depth_m:
             raise ValueError("survey.altitude_m must be less than terrain.depth_m: the camera would be in the air")
+        if self.period_m:
+            self._can_repeat()
         if self.survey.lines > self.images:
             raise ValueError(f"{self.survey.lines} lines need at least as many images, found {self.images}")
         return self
+
+    def _can_repeat(self) -> None:
+        if self.terrain.kind != "rough" or self.terrain.ripple_height_m:
+            raise ValueError("period_m needs terrain.kind rough without ripples")
+        if self.survey.heading_deg or self.survey.altitude_step_m or self.survey.roles == "pairs":
+            raise ValueError("period_m needs lines to the north, all at one altitude, and no pairs")
+        for name, cell_m in (("terrain", self.terrain.cell_m), ("texture", self.texture.cell_m)):
+            if abs(self.period_m / cell_m - round(self.period_m / cell_m)) > 1e-6:
+                raise ValueError(f"period_m must be a whole number of {name}.cell_m, {cell_m:g}")
 
 
 _GOOD_NAVIGATION: Final[dict[str, Any]] = {
@@ -237,6 +252,14 @@ SCENES: Final[dict[str, Scene]] = {
             "terrain": {"kind": "plane", "depth_m": 8.0},
             "survey": {"lines": 4, "altitude_m": 1.8, "altitude_step_m": 0.5, "overlap": 0.4, "sidelap": 0.6},
             "navigation": _GOOD_NAVIGATION,
+        },
+        {
+            "name": "full",
+            "images": 6250,
+            "width": 3648,
+            "period_m": 8.0,
+            "texture": {"cell_m": 0.00125},
+            "survey": {"lines": 25, "altitude_m": 3.0, "overlap": 0.42, "sidelap": 0.13, "heading_deg": 0.0},
         },
         {"name": "demo", "images": 24, "width": 912, "survey": {"overlap": 0.5, "sidelap": 0.45}},
     )

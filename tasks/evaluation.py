@@ -21,6 +21,8 @@ _SOFT_M = 0.02
 _SEARCH_CELLS, _FIT_CELLS = 3000, 20_000
 _SEARCH_M = np.linspace(-1, 1, 21)
 _FOLLOWED = 4
+# A camera that is not quite upright sees farther than its footprint on level ground
+_ASKEW = 1.6
 
 
 class Similarity(NamedTuple):
@@ -149,6 +151,15 @@ def grid_surface(h: NDArray, half_m: float, cell_m: float, depth_m: float) -> Su
     return height
 
 
+def repeated(surface: Surface, period_m: float) -> Surface:
+    """A surface known around the origin that repeats itself east and north."""
+
+    def height(x: Array, y: Array) -> Array:
+        return surface(*(v - period_m * np.round(np.asarray(v) / period_m) for v in (x, y)))
+
+    return height
+
+
 def fit_shift(X: Array, surface: Surface) -> Shift:
     """Finds how cells X (N, 3) must be moved to lie on a surface.
 
@@ -244,12 +255,15 @@ def coverage(
     x, y = np.meshgrid(axis, axis)
     ground = np.stack([x, y, surface(x, y)], -1)
     reach = K[:2, 2] / np.diag(K)[:2]
+    farthest = _ASKEW * np.hypot(*reach) * (C[:, 2] - ground[..., 2].min())
     seen = np.zeros(x.shape, int)
-    for rotation, centre in zip(R, C, strict=True):
-        point = (ground - centre) @ rotation
+    for rotation, centre, away in zip(R, C, farthest, strict=True):
+        column, row = ((np.array([-away, away]) + v + half_m) / square_m for v in centre[:2])
+        near = tuple(slice(max(0, int(low)), max(0, int(high) + 2)) for low, high in (row, column))
+        point = (ground[near] - centre) @ rotation
         with np.errstate(divide="ignore", invalid="ignore"):
             inside = (abs(point[..., :2] / point[..., 2:]) < reach).all(axis=-1)
-        seen += inside & (point[..., 2] > 0)
+        seen[near] += inside & (point[..., 2] > 0)
     there = np.zeros(x.shape, bool)
     column, row = np.round((X[:, :2].T + half_m) / square_m).astype(int)
     within = (column >= 0) & (row >= 0) & (column < len(axis)) & (row < len(axis))

@@ -17,7 +17,7 @@ from .rotations import R_LOCAL_LEVEL, R_level_vehicle, R_vehicle_camera
 
 Array = NDArray[np.float64]
 
-# How long the vehicle sails straight before the first and after the last station of a line.
+# How long the vehicle sails straight before the first and after the last station of a line, at least.
 LEAD_S = 3.0
 # Root mean square sway at wobble 1: across, up (metres), roll, pitch, heading (degrees); and its periods.
 _SWAY = np.array([0.02, 0.03, 0.6, 0.6, 1.1])
@@ -34,6 +34,7 @@ class Plan(NamedTuple):
     survey : speed, heading and number of lines.
     line_m : length of a line between its first and last station, metres.
     spacing_m : distance of neighbouring lines, metres.
+    lead_m : how far the vehicle sails straight before the first and after the last station of a line, metres.
     z_m : level of the reference point, local frame, metres.
     image_time_s : (n,) exposures, seconds from the start of navigation.
     image_role : n roles, as mission.yaml names them.
@@ -43,6 +44,7 @@ class Plan(NamedTuple):
     survey: SurveyScene
     line_m: float
     spacing_m: float
+    lead_m: float
     z_m: float
     image_time_s: Array
     image_role: tuple[Role, ...]
@@ -78,7 +80,12 @@ class Cameras(NamedTuple):
 
 
 def plan(
-    survey: SurveyScene, images: int, footprint_m: tuple[float, float], z_m: float, rng: np.random.Generator
+    survey: SurveyScene,
+    images: int,
+    footprint_m: tuple[float, float],
+    z_m: float,
+    rng: np.random.Generator,
+    period_m: float = 0.0,
 ) -> Plan:
     """Lines and exposures.
 
@@ -89,19 +96,29 @@ def plan(
     footprint_m : an image's extent on the datum across and along the line, metres.
     z_m : level of the reference point, local frame, metres.
     rng : draws the sway.
+    period_m : distance after which stations and sway repeat themselves, along and across the lines; overlap and
+        sidelap are changed a little to allow it. 0: never.
     """
     pair = 2 if survey.roles == "pairs" else 1
     stations = [len(part) for part in np.array_split(np.arange(-(-images // pair)), survey.lines)]
     step, spacing = footprint_m[1] * (1 - survey.overlap), footprint_m[0] * (1 - survey.sidelap)
+    if period_m:  # there and back again within a period
+        step, spacing = period_m / round(period_m / step), period_m / (2 * round(period_m / (2 * spacing)))
     line = step * (max(stations) - 1)
     leg = line + 2 * LEAD_S * survey.speed_m_s + np.pi * spacing / 2
-    way = [k * leg + LEAD_S * survey.speed_m_s + step * np.arange(n) for k, n in enumerate(stations)]
+    if period_m:
+        leg = period_m * np.ceil(leg / period_m)
+    lead = float(leg - line - np.pi * spacing / 2) / 2
+    way = [k * leg + lead + step * np.arange(n) for k, n in enumerate(stations)]
     time, roles = _exposures(np.concatenate(way) / survey.speed_m_s, survey)
     size = (len(_SWAY), _SWAY_WAVES)
     amplitude = survey.wobble * _SWAY[:, None] * np.sqrt(2 / _SWAY_WAVES) * np.ones(size)
     frequency = 2 * np.pi / rng.uniform(*_SWAY_PERIOD_S, size)
+    if period_m:
+        slowest = 2 * np.pi * survey.speed_m_s / period_m
+        frequency = slowest * np.maximum(1, np.round(frequency / slowest))
     sway = np.stack([amplitude, frequency, rng.uniform(0, 2 * np.pi, size)], -1)
-    return Plan(survey, line, spacing, z_m, time[:images], roles[:images], sway)
+    return Plan(survey, line, spacing, lead, z_m, time[:images], roles[:images], sway)
 
 
 def _exposures(station_time_s: NDArray, survey: SurveyScene) -> tuple[NDArray, tuple[Role, ...]]:
@@ -117,8 +134,8 @@ def _exposures(station_time_s: NDArray, survey: SurveyScene) -> tuple[NDArray, t
 def trajectory(plan: Plan, time_s: Array) -> States:
     """The true motion at times (n,), seconds from the start of navigation."""
     survey = plan.survey
-    lead, radius = LEAD_S * survey.speed_m_s, plan.spacing_m / 2
-    straight = plan.line_m + 2 * lead
+    radius = plan.spacing_m / 2
+    straight = plan.line_m + 2 * plan.lead_m
     way = np.asarray(time_s, float) * survey.speed_m_s
     line = np.clip(way // (straight + np.pi * radius), 0, survey.lines - 1)
     way = way - line * (straight + np.pi * radius)

@@ -43,7 +43,7 @@ class Terrain(NamedTuple):
     cone: Array32
 
 
-def make_terrain(scene: TerrainScene, half_m: float, rng: np.random.Generator) -> Terrain:
+def make_terrain(scene: TerrainScene, half_m: float, rng: np.random.Generator, period_m: float = 0.0) -> Terrain:
     """The seabed of a scene, at least half_m to each side of the origin.
 
     Parameters
@@ -52,14 +52,34 @@ def make_terrain(scene: TerrainScene, half_m: float, rng: np.random.Generator) -
         floor) are those of the paper (III.D, IV).
     half_m : metres from the origin to the edges; made a whole number of cells.
     rng : draws the relief of a rough seabed; unused by the other kinds.
+    period_m : a rough seabed repeats itself after this, a whole number of cells, north and east. 0: never.
     """
     cells = int(np.ceil(half_m / scene.cell_m))
     half_m = cells * scene.cell_m
-    axis = np.linspace(-half_m, half_m, 2 * cells + 1)
-    x, y = np.meshgrid(axis, axis)
-    shapes = {"plane": _plane, "box": _box, "pool": _pool, "rough": _rough}
-    h = shapes[scene.kind](scene, x, y, rng).astype(np.float32)
+    if period_m:
+        h = _repeated(scene, cells, round(period_m / scene.cell_m), rng).astype(np.float32)
+    else:
+        axis = np.linspace(-half_m, half_m, 2 * cells + 1)
+        x, y = np.meshgrid(axis, axis)
+        shapes = {"plane": _plane, "box": _box, "pool": _pool, "rough": _rough}
+        h = shapes[scene.kind](scene, x, y, rng).astype(np.float32)
     return Terrain(h, half_m, scene.cell_m, scene.depth_m, cones(h, scene.cell_m))
+
+
+def _repeated(scene: TerrainScene, cells: int, period: int, rng: np.random.Generator) -> Array:
+    """A rough seabed of 2 cells + 1 nodes a side that repeats itself after `period` nodes."""
+    half_m = period * scene.cell_m / 2
+    relief = scene.relief_m * fractal_noise(period, scene.cell_m, 4.0, 2.0, rng)  # of one period already
+    boulders = np.zeros((3 * period, 3 * period))  # a stone over the edge stands on the other side, too
+    middle = slice(period, 2 * period)
+    for _ in range(rng.poisson(scene.boulders_per_m2 * (2 * half_m) ** 2)):
+        stones = np.zeros_like(boulders)
+        _add_boulder(stones, scene, 3 * half_m, rng, within_m=half_m)
+        folded = stones.reshape(3, period, 3, period).max(axis=(0, 2))
+        np.maximum(boulders[middle, middle], folded, out=boulders[middle, middle])
+    h = relief + boulders[middle, middle]
+    index = np.arange(-cells, cells + 1) % period
+    return h[np.ix_(index, index)]
 
 
 def _plane(scene: TerrainScene, x: Array, y: Array, rng: np.random.Generator) -> Array:
@@ -92,11 +112,17 @@ def _rough(scene: TerrainScene, x: Array, y: Array, rng: np.random.Generator) ->
     return h + boulders
 
 
-def _add_boulder(h: Array, scene: TerrainScene, half_m: float, rng: np.random.Generator) -> None:
-    """Raises h, in place, to the top of one lumpy stone: an ellipsoid, flattened on top, with a steep foot."""
+def _add_boulder(
+    h: Array, scene: TerrainScene, half_m: float, rng: np.random.Generator, within_m: float | None = None
+) -> None:
+    """Raises h, in place, to the top of one lumpy stone: an ellipsoid, flattened on top, with a steep foot.
+
+    within_m : how far from the origin its middle may be, east and north; half_m by default.
+    """
     height = scene.boulder_height_m * rng.uniform(0.2, 1.0)
     radius = height * rng.uniform(0.8, 1.8)
-    x0, y0 = rng.uniform(-half_m, half_m, 2)
+    reach = half_m if within_m is None else within_m
+    x0, y0 = rng.uniform(-reach, reach, 2)
     turn, stretch = rng.uniform(0, np.pi), rng.uniform(0.7, 1.4)
     centre = np.array([y0, x0]) + half_m
     low, high = (((centre + side * 1.7 * radius) / scene.cell_m).astype(int) for side in (-1, 1))

@@ -17,26 +17,31 @@ _SEDIMENT = (1.08, 1.0, 0.9)
 _COARSE = 4
 
 
-def make_texture(scene: TextureScene, half_m: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+def make_texture(
+    scene: TextureScene, half_m: float, rng: np.random.Generator, period_m: float = 0.0
+) -> NDArray[np.uint8]:
     """Albedo (n, n, 3), red green blue, 0..255 for 0..1, over the square from -half_m to +half_m.
 
     Sediment mottled at every scale down to a texel, under stones and shells with sharp outlines and colours
     of their own.
+
+    period_m : it repeats itself after this, as with the scene's own period_m. 0: never.
     """
-    size = round(2 * half_m / scene.cell_m)
+    whole = round(2 * half_m / scene.cell_m)
+    period = round((period_m or scene.period_m) / scene.cell_m)
+    size = period if 0 < period < whole else whole
     coarse = fractal_noise(-(-size // _COARSE), _COARSE * scene.cell_m, 2.0, 1.3, rng).astype(np.float32)
     grey = 0.8 * cv2.resize(coarse, (size, size), interpolation=cv2.INTER_CUBIC)
     grain = rng.standard_normal((size, size), np.float32)
     grey += 0.25 * grain + 0.6 * cv2.GaussianBlur(grain, (0, 0), 1.2) / np.float32(0.235)
     grey = np.float32(MEAN_ALBEDO * 255) * (1 + np.float32(scene.contrast) * grey)
     albedo = np.dstack([np.clip(tint * grey, 8, 247).astype(np.uint8) for tint in _SEDIMENT])
-    for _ in range(rng.poisson(scene.spots_per_m2 * (2 * half_m) ** 2)):
+    for _ in range(rng.poisson(scene.spots_per_m2 * (size * scene.cell_m) ** 2)):
         _add_spot(albedo, scene, rng)
-    period = round(scene.period_m / scene.cell_m)
-    if not 0 < period < size:
+    if size == whole:
         return albedo
-    repeats = -(-size // period)
-    return np.tile(albedo[:period, :period], (repeats, repeats, 1))[:size, :size]
+    index = np.arange(whole) % period
+    return albedo[np.ix_(index, index)]
 
 
 def _add_spot(albedo: NDArray[np.uint8], scene: TextureScene, rng: np.random.Generator) -> None:

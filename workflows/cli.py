@@ -123,7 +123,9 @@ def check(mission: MissionArgument, params: ParamsOption = None, set_: SetOption
 def simulate(
     scene: Annotated[
         str,
-        typer.Argument(metavar="SCENE", help="plane, box, pool, reef, sea, night, pairs, sand, port, floor or demo."),
+        typer.Argument(
+            metavar="SCENE", help="plane, box, pool, reef, sea, night, pairs, sand, port, floor, demo or full."
+        ),
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A new folder.")],
     seed: Annotated[int, typer.Option(help="Another seed, another seabed.")] = 0,

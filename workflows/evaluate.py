@@ -183,10 +183,13 @@ def _read_truth(path: Path) -> _Truth:
             )
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     with np.load(folder / "terrain.npz") as t:
-        half_m = float(t["half"])
+        half_m, period_m = float(t["half"]), float(t.get("period", 0.0))
         surface = evaluation.grid_surface(t["h"], half_m, float(t["cell"]), float(t["depth"]))
     frames = truth["frames"]
     R, C, K = np.array([f["R"] for f in frames]), np.array([f["C"] for f in frames]), np.array(truth["K"])
+    if period_m:  # the grid holds little more than one period of a seabed that goes on
+        surface = evaluation.repeated(surface, period_m)
+        half_m += float(abs(C[:, :2]).max())
     return _Truth(truth["lat0"], truth["lon0"], tuple(f["image"] for f in frames), R, C, K, half_m, surface)
 
 

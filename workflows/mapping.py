@@ -43,11 +43,16 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     worst = typical * _WORST_SIGMA if p.grid.max_sigma_m == "auto" else float(p.grid.max_sigma_m)
     m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst)
     outlines = _outlines(state, posed.solution, ranges)
-    linked, agreed = _dense(state, m, posed, images, outlines, ranges)
+    # what is costly does not change with the bathymetry's cell: matching is kept as fine as either of the cells, and
+    # mosaics lie on a surface of their own
+    usual = grids.bathymetry_cell_m(gsd)
+    linked, agreed = _dense(state, m._replace(cell_m=min(cell, usual)), posed, images, outlines, ranges)
     surface_tiles = _surface(state, m, linked, agreed, images, outlines)
+    below = m._replace(cell_m=usual)
+    ground = surface_tiles if below == m else _surface(state, below, linked, agreed, images, outlines)
     textured = [image for image in images if image.texture]
-    light = _lighting(state, m, textured)
-    mosaic = _mosaics(state, m, textured or images, outlines, surface_tiles, mosaic_cell, light, posed)
+    light = _lighting(state, below, textured)
+    mosaic = _mosaics(state, below, textured or images, outlines, ground, mosaic_cell, light, posed)
     return Mapped(m, cell, mosaic_cell, surface_tiles, mosaic, outlines)
 
 
@@ -187,7 +192,8 @@ def _surface(
     for k, tile in enumerate(tiles):
         touching = _touching(outlines, images, tile, margin)
         described = Tile(tile, touching, _of_images(linked, touching))
-        cell_tasks.append(delayed(maps.cells_tile)(m, described, agreed, dask_key_name=state.key("cells", k)))
+        name = state.key(f"cells-{m.cell_m:g}", k)
+        cell_tasks.append(delayed(maps.cells_tile)(m, described, agreed, dask_key_name=name))
     cells: list[Done] = compute(state, maps.CELLS, cell_tasks)
     if not any(done.info["sounded"] for done in cells):
         raise NothingToMap(
@@ -196,13 +202,15 @@ def _surface(
         )
     order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:_GROWTH_TILES]
     sampled = [(tiles[k], cells[k]) for k in sorted(order)]
-    (growth,) = compute(state, maps.GROWTH, [delayed(maps.fit_growth)(m, sampled, dask_key_name=state.key("growth"))])
+    task = delayed(maps.fit_growth)(m, sampled, dask_key_name=state.key(f"growth-{m.cell_m:g}"))
+    (growth,) = compute(state, maps.GROWTH, [task])
     halo = maps.surface.halo_cells(m.max_interpolation_m, m.cell_m)
     surface_tasks = []
     for k, tile in enumerate(tiles):
         around = grids.pad(tile, halo)
         near = [(t, done) for t, done in zip(tiles, cells, strict=True) if grids.intersection(around, t)]
-        surface_tasks.append(delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=state.key("surface", k)))
+        name = state.key(f"surface-{m.cell_m:g}", k)
+        surface_tasks.append(delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=name))
     surfaces: list[Done] = compute(state, maps.SURFACE, surface_tasks)
     for step, done in zip(steps, (cells, [growth], surfaces), strict=True):
         state.ledger.end(step, done)

@@ -19,6 +19,8 @@ from .maps import SURFACE, ground_around, paste
 from .maps_inputs import Image, MapJob, Pair, Tile, context, pose_digest, rows_of
 from .solve import Solution
 
+# Of a pair, at most: a similarity needs two, and all pairs of a mission are held in memory at once
+_ALIGNED_MATCHES = 50
 LIGHTING, ALIGN, MOSAIC = "lighting", "planar-align", "mosaic"
 _VERSION = code_version(sys.modules[__name__])
 
@@ -77,12 +79,13 @@ def align_planar(m: MapJob, images: Sequence[Image], linked: Sequence[Pair]) -> 
 
 
 def _levelled(m: MapJob, linked: Sequence[Pair], poses: Poses, number: dict[int, int], range_m: float):
-    """Matches of the linked pairs as levelled slopes."""
+    """Matches of the linked pairs, some of each, as levelled slopes."""
     sides: tuple[list, list] = ([], [])
     images: tuple[list, list] = ([], [])
     for pair in linked:
         arrays = load(m.job, match.STEP, pair.key, ("uv_i", "uv_j")).arrays
-        for side, row, uv in ((0, pair.i, arrays["uv_i"]), (1, pair.j, arrays["uv_j"])):
+        every = -(-len(arrays["uv_i"]) // _ALIGNED_MATCHES)
+        for side, row, uv in ((0, pair.i, arrays["uv_i"][::every]), (1, pair.j, arrays["uv_j"][::every])):
             slopes = camera.normalised(m.job.calibration.camera, uv.astype(float), range_m)
             sides[side].append(planar.level_slopes(poses.R_local_camera[row], slopes))
             images[side].append(np.full(len(uv), number[row]))

@@ -181,10 +181,11 @@ def _make(scene: Scene, seed: int) -> _Made:
     )
     footprint = (float(slopes[1, 0] - slopes[0, 0]), float(slopes[3, 1] - slopes[2, 1]))
     z = altitude - scene.terrain.depth_m + calibration.mount.translation[2]
-    made = plan(scene.survey, scene.images, footprint, z, _rng(seed, _MOTION))
+    made = plan(scene.survey, scene.images, footprint, z, _rng(seed, _MOTION), scene.period_m)
     poses = cameras(trajectory(made, made.image_time_s), calibration.mount)
-    terrain = make_terrain(scene.terrain, _half_m(scene, camera, poses), _rng(seed, _TERRAIN))
-    texture = make_texture(scene.texture, terrain.half_m, _rng(seed, _TEXTURE))
+    half_m = _half_m(scene, camera, _folded(scene, poses.C_local))
+    terrain = make_terrain(scene.terrain, half_m, _rng(seed, _TERRAIN), scene.period_m)
+    texture = make_texture(scene.texture, terrain.half_m, _rng(seed, _TEXTURE), scene.period_m)
     files = tuple(
         f"{'L' if role == 'laser' else 'V'}_{_time(t).strftime(_PATTERN)}.jpg"
         for t, role in zip(made.image_time_s, made.image_role, strict=True)
@@ -192,13 +193,21 @@ def _make(scene: Scene, seed: int) -> _Made:
     return _Made(scene, seed, calibration, made, poses, terrain, texture, files)
 
 
-def _half_m(scene: Scene, camera: Camera, poses: Cameras) -> float:
-    """Half the side of a square that holds all that the cameras see."""
+def _folded(scene: Scene, X_local: np.ndarray) -> np.ndarray:
+    """Points (N, 3), moved by whole periods to around the origin, where the seabed is made."""
+    if not scene.period_m:
+        return X_local
+    xy = X_local[:, :2]
+    return np.column_stack([xy - scene.period_m * np.round(xy / scene.period_m), X_local[:, 2]])
+
+
+def _half_m(scene: Scene, camera: Camera, C_local: np.ndarray) -> float:
+    """Half the side of a square that holds all that the cameras at C_local (n, 3) see."""
     drop = scene.terrain.slope_drop_m if scene.terrain.kind == "pool" else 3 * scene.terrain.relief_m
     farthest = scene.survey.highest_m + drop + 0.2
     # a few degrees more than the corner's, for the vehicle's roll and pitch
     corner = np.arctan(np.hypot(*normalised(camera, outline(camera, 5), farthest).T)).max() + np.radians(4)
-    return float(abs(poses.C_local[:, :2]).max() + farthest * np.tan(corner) + 0.2)
+    return float(abs(C_local[:, :2]).max() + farthest * np.tan(corner) + 0.2)
 
 
 def _time(seconds: float) -> datetime:
@@ -231,7 +240,7 @@ def _write_navigation(path: Path, made: _Made) -> None:
     rng = _rng(made.seed, _NAVIGATION)
     true = trajectory(made.plan, sample_times(made.plan, navigation.rate_hz))
     said = measured(true, navigation, rng)
-    seabed = height(made.terrain, true.X_local[:, 0], true.X_local[:, 1])
+    seabed = height(made.terrain, *_folded(made.scene, true.X_local)[:, :2].T)
     altitude = measured_altitude(true, seabed, navigation, rng)
     place = MapFrame(None, survey.latitude, survey.longitude).geographic_from_local(said.X_local)
     with path.open("w", newline="") as file:
@@ -267,7 +276,11 @@ def _write_truth(folder: Path, made: _Made) -> None:
         truth |= {"L0": laser.origin, "planes": [[*s.normal, s.offset] for s in laser.sheets]}
     (folder / "truth.json").write_text(json.dumps(truth))
     t = made.terrain
-    np.savez_compressed(folder / "terrain.npz", h=t.h, half=t.half_m, cell=t.cell_m, depth=t.depth_m)
+    grid = {"h": t.h, "half": t.half_m, "cell": t.cell_m, "depth": t.depth_m}
+    if made.scene.period_m:
+        grid["period"] = made.scene.period_m
+    with (folder / "terrain.npz").open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **{name: np.asarray(value) for name, value in grid.items()})
     _write_jpeg(folder / "texture.jpg", made.texture, _TEXTURE_QUALITY)
 
 
@@ -278,15 +291,32 @@ def _write_images(folder: Path, made: _Made) -> None:
     texture = blurred(made.texture, scene.texture.cell_m, pixel)
     world = World(made.terrain, normals(made.terrain), texture, made.calibration.laser, scene.survey.altitude_m)
     optics = Optics(scene.laser, scene.light, scene.sensor)
+    C = _folded(scene, made.poses.C_local)
 
-    def one(k: int) -> None:
-        pose = Cameras(made.poses.R_local_camera[k : k + 1], made.poses.C_local[k : k + 1])
+    def one(alike: list[int]) -> None:
+        k = alike[0]
+        pose = Cameras(made.poses.R_local_camera[k : k + 1], C[k : k + 1])
         image = render(world, view, pose, optics, made.plan.image_role[k], _rng(made.seed, _IMAGE, k))
         _write_jpeg(folder / made.files[k], image, scene.sensor.jpeg_quality)
+        for other in alike[1:]:
+            os.link(folder / made.files[k], folder / made.files[other])
 
     # numpy and OpenCV release the interpreter lock; each thread holds one image
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        list(pool.map(one, range(len(made.files))))
+        list(pool.map(one, _alike(made, C)))
+
+
+def _alike(made: _Made, C_folded: np.ndarray) -> list[list[int]]:
+    """Images that show the same: each on its own, unless seabed and motion repeat themselves."""
+    if not made.scene.period_m:
+        return [[k] for k in range(len(made.files))]
+    poses = np.column_stack([C_folded, made.poses.R_local_camera.reshape(-1, 9)])
+    # what lies at the fold's edge may land on either side of it
+    poses[:, :2] = np.mod(poses[:, :2] + 1e-5, made.scene.period_m)
+    groups: dict[tuple[float, ...], list[int]] = {}
+    for k, pose in enumerate(np.round(poses, 4).tolist()):
+        groups.setdefault(tuple(abs(value) for value in pose[:2]) + tuple(pose[2:]), []).append(k)
+    return list(groups.values())
 
 
 def _write_jpeg(path: Path, rgb: np.ndarray, quality: int) -> None:

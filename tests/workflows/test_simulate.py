@@ -258,3 +258,34 @@ def test_an_empty_folder_may_be_there_and_none_means_unchanged(tmp_path: Path):
     (tmp_path / "m").mkdir()
     assert len(read_truth(simulate(scene, tmp_path / "m", images=None, width=80)).images) == 1
     assert read_truth(tmp_path / "m").calibration.camera.width == 80
+
+
+def test_a_full_mission_repeats_its_images_but_neither_its_track_nor_its_navigation(tmp_path: Path):
+    """Four lines and a bit: what looks the same is one file; all true poses differ by whole periods."""
+    changes = {"terrain": {"cell_m": 0.04}, "texture": {"cell_m": 0.02}, "survey": {"lines": 5}}
+    mission = simulate("full", tmp_path / "full", seed=3, images=60, width=128, **changes)
+    truth, period = read_truth(mission), SCENES["full"].period_m
+    files = {}
+    for k, name in enumerate(truth.images):
+        files.setdefault(os.stat(mission / "images" / name).st_ino, []).append(k)
+    assert len(truth.images) == 60
+    assert len(files) == 32  # eight stations of four lines
+    C, R = truth.poses.C_local, truth.poses.R_local_camera
+    assert len(np.unique(np.round(C, 3), axis=0)) == 60
+    for alike in files.values():
+        apart = C[alike] - C[alike[0]]
+        assert apart[:, :2] / period == pytest.approx(np.round(apart[:, :2] / period), abs=1e-6)
+        assert apart[:, 2] == pytest.approx(0, abs=1e-6)
+        assert R[alike] == pytest.approx(np.broadcast_to(R[alike[0]], R[alike].shape), abs=1e-6)
+    table = pd.read_csv(mission / "navigation.csv")
+    assert table[["latitude", "longitude"]].drop_duplicates().shape[0] == len(table)
+
+
+def test_a_repeated_seabed_has_no_step_where_it_begins_anew(tmp_path: Path):
+    mission = simulate("full", tmp_path / "full", images=40, width=128, texture={"cell_m": 0.02}, survey={"lines": 5})
+    with np.load(mission / "truth/terrain.npz") as t:
+        h, period = t["h"], round(float(t["period"]) / float(t["cell"]))
+    assert (h[period:] == h[:-period]).all()
+    inside = np.abs(np.diff(h[:period], axis=0)).max(1)
+    across = np.abs(h[period] - h[period - 1]).max()
+    assert across < 1.5 * inside.max()
