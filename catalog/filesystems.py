@@ -108,6 +108,8 @@ def write_whole(url: str, data: bytes, scratch: str) -> None:
         with open(temporary, "wb") as file:
             file.write(data)
         os.replace(temporary, path)
+    except OSError as error:  # of a write it does not name the file
+        raise type(error)(error.errno, error.strerror, path) from error
     finally:
         if os.path.exists(temporary):
             os.remove(temporary)

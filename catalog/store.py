@@ -5,6 +5,7 @@ named arrays and a JSON text; it appears whole or not at all, and one that canno
 """
 
 import contextlib
+import errno
 import hashlib
 import io
 import json
@@ -13,8 +14,8 @@ import struct
 import time
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable, Mapping
-from typing import Any, NamedTuple, cast
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from fsspec import AbstractFileSystem
@@ -23,6 +24,8 @@ from numpy.typing import NDArray
 
 from .filesystems import asking, connect, write_whole
 from .runs import is_dead, run_name
+
+R = TypeVar("R")
 
 _INFO, _ARRAY, _SCRATCH = "info.json", ".npy", ".tmp"
 _UNREADABLE = (
@@ -64,23 +67,24 @@ class Store(NamedTuple):
         names : arrays that are wanted, of those that it has; nothing else is read. None: all.
         """
         fs, path = connect(self.path(step, key))
-        try:
-            with asking(fs, path):
-                if names is None or not isinstance(fs, LocalFileSystem):  # at one go, as object stores like it
-                    return _unpack(io.BytesIO(cast(bytes, fs.cat_file(path))), names)
-                with fs.open(path, "rb") as file:
-                    return _unpack(file, names)
-        except _UNREADABLE:
-            return None
+
+        def read() -> Entry:
+            if names is None or not isinstance(fs, LocalFileSystem):  # at one go, as object stores like it
+                return _unpack(io.BytesIO(cast(bytes, fs.cat_file(path))), names)
+            with fs.open(path, "rb") as file:
+                return _unpack(file, names)
+
+        return _unless_damaged(fs, path, read)
 
     def info(self, step: str, key: str) -> dict[str, Any] | None:
         """The record of a result without its arrays, or None when there is none or its directory is damaged."""
         fs, path = connect(self.path(step, key))
-        try:
-            with asking(fs, path), _open(fs, path) as file, zipfile.ZipFile(file) as archive:
-                return json.loads(archive.read(_INFO))
-        except _UNREADABLE:
-            return None
+
+        def read() -> dict[str, Any]:
+            with _open(fs, path) as file, zipfile.ZipFile(file) as archive:
+                return _read_info(archive)[1]
+
+        return _unless_damaged(fs, path, read)
 
     def touch(self, step: str, key: str) -> None:
         """Note that a result was used, for `pruning`; an object store knows only when it was made."""
@@ -141,6 +145,19 @@ class Store(NamedTuple):
         write_whole(self.path(step, key), _pack(arrays, info, compress), f"{self.url}/{_SCRATCH}")
 
 
+def _unless_damaged(fs: AbstractFileSystem, path: str, read: Callable[[], R]) -> R | None:
+    """What is read, or None if there is nothing or it is damaged."""
+    try:
+        with asking(fs, path):
+            return read()
+    except _UNREADABLE:
+        return None
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # of a place before the file's beginning
+            raise
+        return None
+
+
 def _open(fs: AbstractFileSystem, path: str) -> Any:
     if isinstance(fs, LocalFileSystem):
         return fs.open(path, "rb")
@@ -156,17 +173,24 @@ def _pack(arrays: Mapping[str, NDArray], info: Mapping[str, Any], compress: bool
             np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
             method = zipfile.ZIP_DEFLATED if name in squeezed else zipfile.ZIP_STORED
             archive.writestr(f"{name}{_ARRAY}", member.getbuffer(), method, compresslevel=1)
-        archive.writestr(_INFO, json.dumps(dict(info)))
+        archive.writestr(_INFO, json.dumps({"arrays": list(arrays), "info": dict(info)}))
     return buffer.getvalue()
 
 
 def _unpack(file: Any, names: Collection[str] | None) -> Entry:
     with zipfile.ZipFile(file) as archive:
-        info = json.loads(archive.read(_INFO))
-        known = [name.removesuffix(_ARRAY) for name in archive.namelist() if name != _INFO]
+        known, info = _read_info(archive)
         arrays = {
             name: np.lib.format.read_array(io.BytesIO(archive.read(f"{name}{_ARRAY}")), allow_pickle=False)
             for name in known
             if names is None or name in names
         }
     return Entry(arrays, info)
+
+
+def _read_info(archive: zipfile.ZipFile) -> tuple[list[str], dict[str, Any]]:
+    """Names of the arrays, and the record; a name damaged in the archive's directory would be an absent array."""
+    found = json.loads(archive.read(_INFO))
+    if [*(f"{name}{_ARRAY}" for name in found["arrays"]), _INFO] != archive.namelist():
+        raise zipfile.BadZipFile("its directory and its record disagree")
+    return found["arrays"], found["info"]

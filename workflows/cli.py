@@ -3,6 +3,7 @@
 Exit codes: 0 done, 1 failed (of an archive: any mission), 2 invalid input, 130 interrupted, 143 ended by SIGTERM.
 """
 
+import errno
 import json
 import signal
 import sys
@@ -230,8 +231,14 @@ def main() -> None:
         raise
     except Exception as error:  # the last resort: a message for the user, the traceback with --verbose
         log.debug("failed", exc_info=True)
-        _say(f"failed: {str(error) or type(error).__name__}")
+        _say(f"failed: {str(error) or type(error).__name__}{_remedy(error)}")
         sys.exit(FAILED)
+
+
+def _remedy(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "; make room, then run the same command again to go on from here"
+    return ""
 
 
 def _say(why: str) -> None:

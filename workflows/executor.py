@@ -81,7 +81,9 @@ class ClusterExecutor:
         self._wait()
         assert job.footing is not None
         answers = self.client.run(why_not, job.mission_url, job.store, job.footing, on_error="return")
-        problems = [_refused(address, answer) for address, answer in sorted(answers.items()) if answer != ""]
+        # a worker that died over the question refuses nothing, and its successor is asked by its first task
+        refusals = {name: why for name, why in answers.items() if why and not isinstance(why, OSError)}
+        problems = [_refused(address, answer) for address, answer in sorted(refusals.items())]
         if problems:
             raise InvalidInput(problems)
 

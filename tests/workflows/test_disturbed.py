@@ -16,6 +16,7 @@ from typing import Any
 
 import psutil
 import pytest
+import s3fs
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.workflows.run import RunResult, run
 
@@ -190,3 +191,83 @@ def test_two_runs_at_once_make_one_version(mission, calm, tmp_path):
     assert [path.name for path in (tmp_path / ID).glob("v*")] == ["v1"]
     assert differing(tmp_path / ID / "v1", calm.path) == []
     assert left_over(tmp_path) == []
+
+
+FULL_DISK = """\
+mount -t tmpfs -o size={size}k tmpfs {out} || exit 77
+{run} && exit 1
+test $? -eq 1 || exit 2
+ls -d {out}/*/v* && exit 3
+mount -o remount,size=200m {out} && {run} && cp -r {out}/{id}/v1 {kept}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a disk of a few kilobytes")
+@pytest.mark.parametrize("size", [200, 1100, 2600])
+def test_a_disk_that_is_full(mission, calm, tmp_path, size):
+    """While results are stored, and while products are written; with more space the same command goes on."""
+    (tmp_path / "out").mkdir()
+    again = " ".join(command(mission, tmp_path / "out", "--scheduler", "sync"))
+    script = FULL_DISK.format(size=size, out=tmp_path / "out", run=again, id=ID, kept=tmp_path / "v1")
+    done = subprocess.run(
+        ["unshare", "-m", "sh", "-c", script], capture_output=True, text=True, timeout=900, check=False
+    )
+    if done.returncode == 77:
+        pytest.skip("no mount here")
+    assert done.returncode == 0, done.stderr
+    assert "No space left" in done.stderr
+    assert differing(tmp_path / "v1", calm.path) == []
+
+
+@pytest.mark.slow
+def test_an_object_store_that_errs_and_one_that_fails(mission, calm, s3, tmp_path):
+    """A tenth of all requests fail and all are slow: the same result. None is answered: a failure, then the rest."""
+    fs = s3fs.S3FileSystem()
+    fs.put(str(mission), f"{s3.bucket}/disturbed", recursive=True)
+    url, out = s3.url("disturbed"), s3.url("disturbed-out")
+    with s3.misbehaving(errors=0.1, delay_s=0.02):
+        result = run(url, out, PARAMETERS, scheduler="threads", workers=2)
+    fs.get(f"{s3.bucket}/disturbed-out/{ID}/v1", str(tmp_path / "v1"), recursive=True)
+    assert differing(tmp_path / "v1", calm.path) == []
+    assert result.new
+    fs.rm(f"{s3.bucket}/disturbed-out", recursive=True)
+    tries = {**os.environ, "AWS_MAX_ATTEMPTS": "2"}
+    process = subprocess.Popen(
+        command(url, out, "--scheduler", "threads"), stderr=subprocess.PIPE, text=True, env=tries
+    )
+    while not [path for path in fs.find(f"{s3.bucket}/disturbed-out") if path.endswith(".npz")]:
+        assert process.poll() is None
+        time.sleep(0.05)
+    with s3.misbehaving(down=True):
+        _, said = process.communicate(timeout=4 * PATIENCE_S)
+    assert process.returncode == 1
+    assert "unwell" in said
+    assert not [path for path in fs.find(f"{s3.bucket}/disturbed-out") if "/v1/" in path]
+    assert finish(url, out, "--scheduler", "threads").returncode == 0
+    fs.get(f"{s3.bucket}/disturbed-out/{ID}/v1", str(tmp_path / "again"), recursive=True)
+    assert differing(tmp_path / "again", calm.path) == []
+    left = [path for path in fs.find(f"{s3.bucket}/disturbed-out") if "/.tmp/" in path or "/.claims/" in path]
+    assert left == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_worker_without_a_nanny_dies_and_the_other_goes_on(mission, calm, s3, tmp_path, victim):
+    s3fs.S3FileSystem().put(str(mission), f"{s3.bucket}/halved{victim}", recursive=True)
+    url, out = s3.url(f"halved{victim}"), s3.url(f"halved-out{victim}")
+    with (
+        fleet.scheduler(tmp_path / "scheduler") as (address, _),
+        fleet.worker(address, tmp_path / "one") as one,
+        fleet.worker(address, tmp_path / "two") as two,
+    ):
+        process = subprocess.Popen(command(url, out, "--scheduler", address), stderr=subprocess.PIPE, text=True)
+        fs = s3fs.S3FileSystem()
+        while len([path for path in fs.find(f"{s3.bucket}/halved-out{victim}") if path.endswith(".npz")]) < 4:
+            assert process.poll() is None
+            time.sleep(0.05)
+        fleet.end((one, two)[victim], signal.SIGKILL)
+        _, said = process.communicate(timeout=4 * PATIENCE_S)
+    assert process.returncode == 0, said
+    fs.get(f"{s3.bucket}/halved-out{victim}/{ID}/v1", str(tmp_path / "v1"), recursive=True)
+    assert differing(tmp_path / "v1", calm.path) == []
