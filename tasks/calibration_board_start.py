@@ -20,17 +20,6 @@ DISTORTION: Final = {
     "flat-port": ("k1", "k2", "p1", "p2", "k3"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
-_POINTS_A_LINE: Final = 60
-
-
-def thinned(uv: Array, sheet: Indices, sigma_px: Array) -> Indices:
-    """Indices of at most sixty points of each line (N,), spread along it."""
-    chosen = []
-    for number in np.unique(sheet[sheet >= 0]):
-        own = np.flatnonzero(sheet == number)
-        own = own[np.argsort(uv[own, 1], kind="stable")]
-        chosen.append(own[np.unique(np.linspace(0, len(own) - 1, min(len(own), _POINTS_A_LINE)).astype(int))])
-    return np.concatenate(chosen) if chosen else np.zeros(0, np.intp)
 
 
 def first_camera(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.calibration import Calibration
-from .calibration_lines import Lines
+from .calibration_lines import Lines, averaged
 from .calibration_sheets import SheetBasis, basis, cast_rays, moved
 from .calibration_solve import Layout, Solved, solve, unit_sigma
 from .camera import rays
@@ -21,7 +21,6 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 ROUNDS: Final = 4
-_POINTS_AN_ARM: Final = 60
 _WHITE_SHARE: Final = 0.3  # of a stated sigma that changes from image to image, to begin with
 _OUTLIER_SIGMAS: Final = 4.0
 # sheets (2 x 3), boresight roll and pitch, constant error of the altimeter
@@ -122,16 +121,10 @@ class _Problem(NamedTuple):
 
 
 def gather(lines: list[Lines]) -> tuple[Array, Indices, NDArray[np.int8], Array]:
-    """uv, image, arm and sigma_px of the lines of n images, at most sixty points of an arm, spread along it."""
-    parts = []
-    for k, one in enumerate(lines):
-        for arm in (0, 1):
-            own = np.flatnonzero(one.arm == arm)
-            own = own[np.argsort(one.uv[own, 1], kind="stable")]
-            chosen = own[np.unique(np.linspace(0, len(own) - 1, min(len(own), _POINTS_AN_ARM)).astype(int))]
-            parts.append((one.uv[chosen], np.full(len(chosen), k), one.arm[chosen], one.sigma_px[chosen]))
-    uv, image, arm, sigma = (np.concatenate(field) for field in zip(*parts, strict=True))
-    return uv, image, arm, sigma
+    """uv, image, arm and sigma_px of the lines of n images, neighbouring rows averaged."""
+    parts = [averaged(one.uv, one.arm.astype(np.intp), one.sigma_px) for one in lines]
+    uv, arm, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return uv, np.repeat(np.arange(len(parts)), [len(own) for own, _, _ in parts]), arm.astype(np.int8), sigma
 
 
 def calibrate_flat(data: FlatData, start: Calibration, priors: Priors, boresight: bool = True) -> FlatResult:

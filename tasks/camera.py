@@ -3,7 +3,9 @@
 Pixels (u, v) have their centres at integer coordinates; rays and points are in the camera frame, metres.
 """
 
-from typing import NamedTuple
+from collections.abc import Hashable
+from functools import lru_cache
+from typing import Final, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -14,6 +16,9 @@ from ..schemas.calibration import Camera, Port
 Array = NDArray[np.float64]
 
 _NEWTON_STEPS = 12
+# Iterations that are tried to undo distortion, and what more of them may still move a corner by, pixels.
+_ITERATIONS: Final = (5, 8, 12, 20, 40)
+_SETTLED_PX: Final = 1e-9
 
 
 class Rays(NamedTuple):
@@ -41,14 +46,29 @@ def _coefficients(camera: Camera) -> Array:
 
 def _undistort(camera: Camera, uv: Array) -> Array:
     """Pinhole slopes (N, 2) x/z, y/z of pixels, before any refraction."""
-    K, pixels = camera_matrix(camera), np.ascontiguousarray(uv, dtype=np.float64).reshape(-1, 1, 2)
+    pixels = np.ascontiguousarray(uv, dtype=np.float64).reshape(-1, 1, 2)
     if not len(pixels):
         return np.zeros((0, 2))
     if camera.model == "fisheye":
-        return np.asarray(cv2.fisheye.undistortPoints(pixels, K, _coefficients(camera)), np.float64).reshape(-1, 2)
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-12)
-    slopes = cv2.undistortPoints(pixels, K, _coefficients(camera), criteria=criteria)
-    return np.asarray(slopes, np.float64).reshape(-1, 2)
+        slopes = cv2.fisheye.undistortPoints(pixels, camera_matrix(camera), _coefficients(camera))
+        return np.asarray(slopes, np.float64).reshape(-1, 2)
+    return _after(camera, pixels, _iterations(cast(Hashable, camera))).reshape(-1, 2)
+
+
+def _after(camera: Camera, pixels: Array, iterations: int) -> Array:
+    """Pinhole slopes (N, 1, 2) of pixels (N, 1, 2) after so many iterations: to test for an end costs as much again."""
+    criteria = (cv2.TERM_CRITERIA_COUNT, iterations, 0)
+    K, distortion = camera_matrix(camera), _coefficients(camera)
+    return np.asarray(cv2.undistortPoints(pixels, K, distortion, criteria=criteria), np.float64)
+
+
+@lru_cache(maxsize=16)
+def _iterations(camera: Camera) -> int:
+    """How many iterations undo a camera's distortion at its image's border, where it is strongest."""
+    border = outline(camera, 9)[:, None]
+    settled = _after(camera, border, _ITERATIONS[-1])
+    moved = [camera.fx * np.abs(_after(camera, border, count) - settled).max() for count in _ITERATIONS]
+    return _ITERATIONS[int(np.argmax(np.array(moved) < _SETTLED_PX))]
 
 
 def _distort(camera: Camera, slopes: Array) -> Array:
@@ -71,8 +91,9 @@ def rays(camera: Camera, uv: Array) -> Rays:
     outer face of the window.
     """
     slopes = _undistort(camera, uv)
-    direction = np.column_stack([slopes, np.ones(len(slopes))])
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = np.empty((len(slopes), 3))
+    direction[:, 2] = 1 / np.sqrt(1 + slopes[:, 0] ** 2 + slopes[:, 1] ** 2)
+    direction[:, :2] = slopes * direction[:, 2:]
     if camera.port is None:
         return Rays(np.zeros_like(direction), direction)
     return _through_port(camera.port, slopes, direction)

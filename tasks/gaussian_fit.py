@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from .medians import median
+
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
-# Variance of pixels beside the line, and what a line's height and its square multiply that by.
-Noise = tuple[float, float, float]
-
 # Half the window, where the ground beside the line begins, where the fit ends; sigmas of the line.
 WINDOW: Final = 4.5
 GROUND: Final = 3.2
@@ -29,6 +28,8 @@ _GROUND_ROWS, _WIDTH_ROWS, _NOISE_ROWS = 9, 41, 31
 # Bands of height, of the usual line's, in which the noise is measured, in so many profiles.
 _SHARES: Final = ((0.1, 0.35), (0.35, 0.65), (0.65, 1.0), (1.0, 2.0))
 _SAMPLES: Final = 110
+# Heights, of the usual one, beyond which the noise is thought to grow no more.
+_BRIGHTEST: Final = np.float32(4)
 _TINY: Final = np.float32(1e-15)
 
 
@@ -53,6 +54,22 @@ class Fit(NamedTuple):
     misfit: Array
 
 
+class _Noise(NamedTuple):
+    """How pixels' variances grow with the line's light.
+
+    Attributes
+    ----------
+    beside : variance of pixels beside the line.
+    linear, square : what light, as a share of the usual height, and its square add, of that.
+    usual : height of most lines.
+    """
+
+    beside: float
+    linear: float
+    square: float
+    usual: float
+
+
 class _State(NamedTuple):
     """Of each profile (N,): place, width, height; normal equations of height and place."""
 
@@ -62,26 +79,27 @@ class _State(NamedTuple):
     normals: tuple[NDArray, NDArray, NDArray]
 
 
-def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> Fit:
+def fit(light: Floats, mask: Floats, width: float, floor: float) -> Fit:
     """Fit a Gaussian to each profile, nearly in its middle already and on no ground.
 
     Parameters
     ----------
     light : (M, N) profiles, M odd; neighbours in N are neighbours on the line.
-    used : (M, N) pixels to use.
+    mask : (M, N) 1 for pixels to use, 0 for others.
     width : standard deviation of most, pixels.
     floor : variance that pixels have at least: that of rounding to levels.
     """
     half = len(light) // 2
-    x, mask = np.arange(-half, half + 1, dtype=np.float32)[:, None], used.astype(np.float32, order="C")
+    x = np.arange(-half, half + 1, dtype=np.float32)[:, None]
     reach = min(int(1.2 * FIT * width) + 1, half)
     core = slice(half - reach, half + reach + 1)
-    state, noise = _first(light[core], x[core], width), (floor, 0.0, 0.0)
-    steps = _STEPS if used[half].mean() > 0.5 else _STEPS_CLIPPED
+    state = _first(light[core], x[core], width)
+    noise = _Noise(floor, 0.0, 0.0, max(median(state.height), 1e-9))
+    steps = _STEPS if np.count_nonzero(mask[half]) > 0.5 * mask.shape[1] else _STEPS_CLIPPED
     for k in range(steps):
         state = _improved(state, light[core], mask[core], x[core], noise, last=k == steps - 1)
         if k == steps - 2:
-            noise = _noise(state, light, mask, x, floor)
+            noise = _noise(state, light, mask, x, noise)
     level, misfit = _noise_level(state, light, mask, x, noise)
     gg, gd, dd = state.normals
     determinant = np.maximum(gg * dd - gd**2, _TINY)
@@ -90,20 +108,46 @@ def fit(light: Floats, used: NDArray[np.bool_], width: float, floor: float) -> F
     return Fit(*(np.asarray(part, float) for part in (state.place, sigma, state.width, snr, state.height, misfit)))
 
 
-def ground(light: Floats, used: NDArray[np.bool_], width: float) -> Floats:
-    """Straight lines (M, N) through what lies to both sides of each profile (M, N), averaged over some of them."""
+def misfit(light: Floats, mask: Floats, found: Fit, width: Array, floor: float) -> NDArray:
+    """Scatter squared (N,) of what Gaussians of given widths (N,) leave of profiles, over that of noise.
+
+    Parameters
+    ----------
+    light, mask, floor : as in `fit`.
+    found : what that gave.
+    """
+    half = len(light) // 2
+    x = np.arange(-half, half + 1, dtype=np.float32)[:, None]
+    place, free, height = (np.asarray(part, np.float32) for part in (found.place, found.width, found.height))
+    normals = height, height, height
+    noise = _Noise(floor, 0.0, 0.0, max(median(height), 1e-9))
+    noise = _noise(_State(place, free, height, normals), light, mask, x, noise)
+    state = _State(place, np.asarray(width, np.float32), height, normals)
+    for _ in range(_STEPS):
+        state = _improved(state, light, mask, x, noise, last=True)
+    up, down = _residuals(state, light, mask, x, noise)
+    return up / down
+
+
+def ground(light: Floats, mask: Floats, width: float) -> Floats:
+    """Straight lines (M, N) through what lies to both sides of each profile (M, N), averaged over some of them.
+
+    mask : (M, N) 1 for pixels to use, 0 for others.
+    """
     half = len(light) // 2
     x = np.arange(-half, half + 1, dtype=np.float32)
     mean, place = [], []
     for side in (x < -GROUND * width, x > GROUND * width):
         part = slice(*np.flatnonzero(side)[[0, -1]] + [0, 1])
-        seen = used[part].astype(np.float32)
-        count, total = _along(seen.sum(axis=0), _GROUND_ROWS), _along(_dot(light[part], seen), _GROUND_ROWS)
-        mean.append(np.where(count > 1e-3, total / np.maximum(count, 1e-3), np.nan))
+        count = _along(mask[part].sum(axis=0), _GROUND_ROWS)
+        total = _along(_dot(light[part], mask[part]), _GROUND_ROWS)
+        mean.append((total / np.maximum(count, np.float32(1e-3)), count > 1e-3))
         place.append(float(x[side].mean()))
-    left, right = (np.where(np.isnan(a), np.where(np.isnan(b), 0, b), a) for a, b in (mean, mean[::-1]))
+    (left, seen_left), (right, seen_right) = mean
+    # a side that is not seen is thought to be as the other; where neither is there is no ground
+    left, right = np.where(seen_left, left, right * seen_right), np.where(seen_right, right, left * seen_left)
     share = (x[:, None] - np.float32(place[0])) / np.float32(place[1] - place[0])
-    return np.asarray(left + (right - left) * share, np.float32)
+    return np.asarray((right - left) * share + left, np.float32)
 
 
 def _dot(a: NDArray, b: NDArray) -> NDArray:
@@ -143,13 +187,13 @@ class _Sums(NamedTuple):
     b2: Floats
 
 
-def _improved(state: _State, light: Floats, mask: Floats, x: Floats, noise: Noise, last: bool) -> _State:
+def _improved(state: _State, light: Floats, mask: Floats, x: Floats, noise: _Noise, last: bool) -> _State:
     """One step of Gauss and Newton's for place, height and, but in the last, width."""
     width = state.width
     t, square, g = _gaussian(state, x)
     wg = mask * (square < np.float32(FIT**2))
     wg *= g
-    if noise[1] or noise[2]:
+    if noise.linear or noise.square:
         wg /= _variance(state.height, g, noise)
     a, b = wg * g, wg * light
     a2, b1 = a * square, b * t
@@ -159,14 +203,15 @@ def _improved(state: _State, light: Floats, mask: Floats, x: Floats, noise: Nois
     height = np.maximum((sums.a2 * sums.b0 - sums.a1 * sums.b1) / determinant, np.float32(1e-7))
     step = np.clip((sums.a0 * sums.b1 - sums.a1 * sums.b0) / determinant / height, -1, 1)
     place = np.clip(state.place + width * step, x[0], x[-1])
-    beside = np.float32(noise[0])
+    beside = np.float32(noise.beside)
     normals = sums.a0 / beside, sums.a1 / width / beside, sums.a2 / width**2 / beside
     return _State(place, width if last else _wider(width, height, sums), height, normals)
 
 
 def _gaussian(state: _State, x: Floats) -> tuple[NDArray, NDArray, NDArray]:
     """Distance from the place in widths (M, N), its square, and the Gaussian."""
-    t = (x - state.place) * (1 / state.width)
+    t = x - state.place
+    t *= 1 / state.width
     square = t * t
     return t, square, np.asarray(cv2.exp(np.float32(-0.5) * square), np.float32)
 
@@ -182,50 +227,61 @@ def _wider(width: Floats, height: Floats, sums: _Sums) -> Floats:
     return np.maximum(width + change, np.float32(0.5))
 
 
-def _noise(state: _State, light: Floats, mask: Floats, x: Floats, floor: float) -> Noise:
+def _noise(state: _State, light: Floats, mask: Floats, x: Floats, before: _Noise) -> _Noise:
     """What pixels' variances are beside the line and on it, from the residuals of some profiles."""
     some = slice(None, None, max(1, mask.shape[1] // _SAMPLES))
     part = _State(state.place[some], state.width[some], state.height[some], state.normals)
     seen, (_, square, gaussian) = mask[:, some] > 0, _gaussian(part, x)
-    share = (_share(state.height)[some] * gaussian)[seen]
+    share = (_share(part.height, before) * gaussian)[seen]
     residual = np.abs(light[:, some] - part.height * gaussian)[seen]
-    outer = (square > GROUND**2)[seen]
-    if outer.sum() < 20:
-        return floor, 0.0, 0.0
+    outer, floor = (square > GROUND**2)[seen], before.beside
+    if np.count_nonzero(outer) < 20:
+        return before
     size, places = [residual[outer]], [0.0]
     for low, high in _SHARES:
-        part = ~outer & (share > low) & (share < high)
-        if part.sum() > 20:
-            size.append(residual[part])
-            places.append(float(share[part].mean()))
-    variance = np.array([max((1.4826 * float(np.median(part))) ** 2, floor) for part in size])
+        band = ~outer & (share > low) & (share < high)
+        if np.count_nonzero(band) > 20:
+            size.append(residual[band])
+            places.append(float(share[band].mean()))
+    variance = np.array([max((1.4826 * median(band)) ** 2, floor) for band in size])
     # height and place, fitted, take two of the pixels on the line
-    pixels = max(3.0 * float(np.median(state.width)), 3.0)
+    pixels = max(3.0 * median(part.width), 3.0)
     variance[1:] *= pixels / (pixels - 1.5)
     place = np.array(places)
     design = np.column_stack([np.ones_like(place), place, place**2]) / variance[:, None]
     beside, linear, square = nnls(design, np.ones(len(place)))[0]
     beside = max(beside, 0.5 * variance[0], floor)
-    return float(beside), float(linear / beside), float(square / beside)
+    return before._replace(beside=float(beside), linear=float(linear / beside), square=float(square / beside))
 
 
-def _share(height: NDArray) -> NDArray:
+def _share(height: NDArray, noise: _Noise) -> NDArray:
     """Height of each line (N,) over that of most."""
-    return np.minimum(height / np.float32(max(float(np.median(height)), 1e-9)), np.float32(4))
+    return np.minimum(height / np.float32(noise.usual), _BRIGHTEST)
 
 
-def _variance(height: NDArray, gaussian: NDArray, noise: Noise) -> NDArray:
+def _variance(height: NDArray, gaussian: NDArray, noise: _Noise) -> NDArray:
     """Of each pixel (M, N), over that beside the line."""
-    linear, square = np.float32(noise[1]), np.float32(noise[2])
-    on = _share(height) * gaussian
-    return np.float32(1) + on * (linear + square * on)
+    on = _share(height, noise) * gaussian
+    variance = np.float32(noise.square) * on
+    variance += np.float32(noise.linear)
+    variance *= on
+    variance += np.float32(1)
+    return variance
 
 
-def _noise_level(state: _State, light: Floats, mask: Floats, x: Floats, noise: Noise) -> tuple[NDArray, NDArray]:
+def _noise_level(state: _State, light: Floats, mask: Floats, x: Floats, noise: _Noise) -> tuple[NDArray, NDArray]:
     """Scatter of the residuals (N,) over what was expected, of some rows together; its square in each row to that."""
-    gaussian = _gaussian(state, x)[2]
-    residual = light - state.height * gaussian
-    squares = residual * residual / (np.float32(noise[0]) * _variance(state.height, gaussian, noise))
-    up, down = _dot(np.minimum(squares, np.float32(16)), mask), np.maximum(mask.sum(axis=0) - 2, np.float32(0.5))
+    up, down = _residuals(state, light, mask, x, noise)
     around = np.clip(_along(up, _NOISE_ROWS) / _along(down, _NOISE_ROWS), np.float32(0.3), np.float32(30))
     return np.sqrt(around), up / down / around
+
+
+def _residuals(state: _State, light: Floats, mask: Floats, x: Floats, noise: _Noise) -> tuple[NDArray, NDArray]:
+    """Sums (N,) of the squares of the residuals over what was expected, and how many there are, two fitted less."""
+    gaussian = _gaussian(state, x)[2]
+    squares = light - state.height * gaussian
+    squares *= squares
+    squares /= _variance(state.height, gaussian, noise)
+    beside = np.float32(noise.beside)
+    up = _dot(np.minimum(squares, np.float32(16) * beside), mask) / beside
+    return up, np.maximum(mask.sum(axis=0) - 2, np.float32(0.5))

@@ -343,12 +343,27 @@ def glow(image_bgr: NDArray[np.uint8], line_uv: Array, halfwidth_px: float, patc
     small = cv2.resize(image_bgr[:rows, :columns], (width, height), interpolation=cv2.INTER_AREA)
     # eight grey levels keep the noise of a dark image from counting as colour; 64 makes no colour a quarter of 255
     blue, green, red = (small[..., k].astype(np.float32) + 8 for k in range(3))
-    ratio = np.clip(128 * green / (blue + red), 0, 255).astype(np.uint8)
-    # of every other patch: the median of a fifth of the image
-    around = cv2.medianBlur(np.ascontiguousarray(ratio[::2, ::2]), min(width, height) // 10 | 1)
+    ratio = np.minimum(128 * green / (blue + red), 255).astype(np.uint8)
+    # of every third patch: the median of a fifth of the image
+    around = cv2.medianBlur(np.ascontiguousarray(ratio[::3, ::3]), min(width, height) // 15 | 1)
     around = cv2.resize(around, (width, height), interpolation=cv2.INTER_NEAREST)
-    patch = cv2.connectedComponents((ratio > 1.15 * around).astype(np.uint8), connectivity=8)[1]
-    drawn = mask((height, width), (line_uv[::2] + 0.5) / scale - 0.5, halfwidth_px / scale[0])
-    touched = np.unique(patch[drawn])
-    rows, columns = np.nonzero(np.isin(patch, touched[touched > 0]) & ~drawn)
+    patch = np.asarray(cv2.connectedComponents((ratio > 1.15 * around).astype(np.uint8), connectivity=8)[1], np.intp)
+    drawn = _discs((height, width), (line_uv + 0.5) / scale - 0.5, halfwidth_px / scale[0])
+    touched = np.zeros(int(patch.max()) + 1, bool)
+    touched[patch[drawn]] = True
+    touched[0] = False
+    rows, columns = np.nonzero(touched[patch] & ~drawn)
     return (np.column_stack([columns, rows]).astype(np.float64) + 0.5) * scale - 0.5
+
+
+def _discs(shape: tuple[int, int], uv: Array, halfwidth_px: float) -> NDArray[np.bool_]:
+    """What mask() gives, of a small image."""
+    radius = max(1, round(halfwidth_px))
+    height, width = shape
+    drawn = np.zeros((height + 2 * radius, width + 2 * radius), np.uint8)
+    column, row = (part + radius for part in np.round(uv).astype(np.intp).T)
+    inside = (column >= 0) & (column < drawn.shape[1]) & (row >= 0) & (row < drawn.shape[0])
+    drawn[row[inside], column[inside]] = 1
+    disc = np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8)
+    cv2.circle(disc, (radius, radius), radius, 1, cv2.FILLED)
+    return np.asarray(cv2.dilate(drawn, disc), bool)[radius:-radius, radius:-radius]

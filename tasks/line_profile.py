@@ -14,7 +14,8 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from . import gaussian_fit
-from .laser_colour import averaged_linear, laser_light, linear_light, running_median, white_pixels
+from .laser_colour import laser_light, linear_light, white_pixels
+from .medians import median, running_median
 from .sheet_search import Arms, Piece
 
 Array = NDArray[np.float64]
@@ -31,8 +32,19 @@ _VAGUE: Final = 0.5
 _BRIGHT: Final = 3.0
 # Nor, near an end of the line, one that has less than this share of its neighbours' brightness.
 _FADING: Final = 0.5
+# What the light of the other side of a step adds to sigma there, widths.
+_EDGE: Final = 0.19
 # Nor one whose profile is so much less like a line than those around it.
 _MISFIT: Final = 4.0
+# The same in grey images, of the usual misfit and brightness along an arm; and the share of such rows, of so many
+# side by side, that makes none of them believed.
+_ODD, _GREY_BRIGHT, _GREY_STOPS = 2.0, 4.0, 0.6
+_CROWD, _CROWD_ROWS = 0.2, 17
+# A stretch of line in a grey image ends where it steps aside, in widths and columns a row; shorter ones, in widths, are
+# not believed.
+_STEP_WIDTHS, _STEEPEST, _SHORT_WIDTHS = 0.7, 1.5, 12.0
+# Nor is an arm of which less than this share is seen, of the rows from its first to its last point.
+_COVERED: Final = 0.4
 # How far from the line's rough place, in widths, it may be found.
 _ASTRAY: Final = 1.2
 _LEAST_SNR: Final = 4.0
@@ -200,7 +212,7 @@ def _centred(image: NDArray[np.uint8], rows: _Rows, box_px: float, factor: int) 
     """Rough columns improved at full resolution: the strongest peak near them, of some rows together."""
     if not len(rows.v):
         return rows
-    every, columns = max(1, factor // 2), 1 + 2 * int(box_px / 8)
+    every, columns = max(1, 2 * factor // 3), 1 + 2 * int(box_px / 8)
     reach, wide = factor // columns + 1, int(np.ceil(1.5 * box_px / columns)) + 1
     v, centre = rows.v[::every], np.round(rows.u[::every]).astype(np.intp)
     half = reach + wide
@@ -234,15 +246,17 @@ def _typical_width(image: NDArray[np.uint8], v: Indices, centre: Indices, box_px
     light = linear[_green(_strip(image, v[some], centre[some], half)[0])]
     ends = max(1, half // 4)
     ground = 0.5 * (light[:, :ends].mean(axis=1) + light[:, -ends:].mean(axis=1))
-    profile = np.median(light - ground[:, None], axis=0).astype(float)
+    profile = np.sort((light - ground[:, None]).T, axis=1)[:, len(light) // 2].astype(float)
     x = np.arange(-half, half + 1)
     sigma = half / 3
     for _ in range(12):
-        wide = 1.5 * sigma
+        before, wide = sigma, 1.5 * sigma
         weight = np.maximum(profile, 0) * np.exp(-0.5 * (x / wide) ** 2)
         spread = float((weight * x**2).sum() / max(weight.sum(), 1e-12))
         # the weight narrows a Gaussian profile: 1/spread = 1/sigma^2 + 1/wide^2
-        sigma = np.sqrt(1 / max(1 / max(spread, 0.05) - 1 / wide**2, (1.5 / half) ** 2))
+        sigma = float(np.sqrt(1 / max(1 / max(spread, 0.05) - 1 / wide**2, (1.5 / half) ** 2)))
+        if abs(sigma - before) < 0.01 * sigma:
+            break
     return float(np.clip(sigma, 0.6, half / 1.5))
 
 
@@ -258,48 +272,88 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
         columns = 1
     half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
     level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
-    green, shine = _green(level), averaged_linear(level, columns, linear)
-    used, unclipped = _all(inside, columns).T, _all(green < _CLIPPED, columns).T
-    used = used & ~_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns).T
-    light = laser_light(shine, gaussian_fit.GROUND * width / columns)
-    light -= gaussian_fit.ground(light, used, width / columns)
+    green, shine = _green(level), np.asarray(cv2.LUT(level, linear), np.float32)
+    mask, unclipped = _all(inside, columns).astype(np.float32), _all(green < _CLIPPED, columns)
+    mask[_lit_by_other((rows.other - centre) / columns, half, gaussian_fit.FIT * width / columns)] = 0
+    light = laser_light(shine, gaussian_fit.GROUND * width, columns)
+    light -= gaussian_fit.ground(light, mask, width / columns)
     if image.ndim == 3:
-        used &= ~white_pixels(shine, light)
-    typical = int(np.median(green[::7, ::3]))
+        mask *= ~white_pixels(shine, light, columns)
+    typical = int(median(green[::7, ::3]))
     floor = max(float(linear[min(typical + 1, 255)] - linear[min(typical, 254)]) ** 2 / 12 / columns, 1e-10)
-    found = gaussian_fit.fit(light, used & unclipped, width / columns, floor)
+    found = gaussian_fit.fit(light, mask * unclipped, width / columns, floor)
     u, sigma, width = centre + columns * found.place, columns * found.sigma, columns * found.width
     share = found.height / running_median(found.height)
     strange = (share > _BRIGHT) | (found.misfit > _MISFIT)
-    strange |= (share < _FADING) & unclipped[half] & _near_end(rows, np.where(strange, np.nan, u), width)
-    fit = _Fit(np.where(strange, np.nan, u), sigma, width, found.signal_to_noise)
-    return _accepted(fit, rows, image.shape[1])
+    to_end = _rows_to_end(rows, np.where(strange, np.nan, u), width)
+    # light that a line leaves within a width of its end is half a line
+    strange |= (share < _FADING) & unclipped[half] & (to_end <= width)
+    sigma = np.hypot(sigma, _EDGE * width * np.exp(-0.5 * to_end / width))
+    if image.ndim == 2:
+        usual = running_median(found.width, max(len(found.width) // 3, 33), 64)
+        strange |= _unlike_the_rest(found, gaussian_fit.misfit(light, mask * unclipped, found, usual, floor))
+    fit = _accepted(_Fit(np.where(strange, np.nan, u), sigma, width, found.signal_to_noise), rows, image.shape[1])
+    return fit if image.ndim == 3 else fit._replace(u=np.where(_short(rows.v, fit), np.nan, fit.u))
 
 
-def _near_end(rows: _Rows, u: Array, width: Array) -> NDArray[np.bool_]:
-    """Which points (N,) are within a width of where the line ends or jumps: light that it leaves there is half a line.
+def _unlike_the_rest(found: gaussian_fit.Fit, misfit: NDArray) -> NDArray[np.bool_]:
+    """Which profiles (N,) are not the line's, told by their shape, as a grey image has no colour to tell by.
+
+    A line is as wide as along much of its arm, as the range changes slowly; what bubbles and shells leave on it or
+    beside it is narrower, broader, brighter or double. Where there is much of it the rest is not believed either.
+
+    misfit : (N,) scatter squared that Gaussians of the usual width leave.
+    """
+    rows = len(misfit)
+    stops = np.log2(misfit / running_median(misfit, max(rows // 3, 33), 64) + 1e-3)
+    # bubbles are in the upper half only
+    odd = stops > _ODD * (median(stops) - float(np.quantile(stops, 0.16)))
+    stops = np.abs(np.log2(np.maximum(found.height / median(found.height), 1e-3)))
+    odd |= stops > np.maximum(_GREY_BRIGHT * median(stops), _GREY_STOPS)
+    return cv2.blur(odd.astype(np.float32)[None], (_CROWD_ROWS, 1)).ravel() > _CROWD
+
+
+def _short(v: Indices, fit: _Fit) -> NDArray[np.bool_]:
+    """Points (N,) on stretches of line so short that a bubble may be all there is to them."""
+    seen = np.flatnonzero(np.isfinite(fit.u))
+    if not len(seen):
+        return np.zeros(len(v), bool)
+    width, gap = median(fit.width[seen]), np.diff(v[seen])
+    broken = (gap > _CROWD_ROWS) | (gap < 1) | (np.abs(np.diff(fit.u[seen])) > _STEP_WIDTHS * width + _STEEPEST * gap)
+    stretch = np.concatenate([[0], np.cumsum(broken)])
+    long = np.bincount(stretch)[stretch] >= _SHORT_WIDTHS * width
+    short = np.ones(len(v), bool)
+    # pieces here and there are no line
+    if long.any() and np.count_nonzero(long) > _COVERED * np.ptp(v[seen[long]]):
+        short[seen] = ~long
+    return short
+
+
+def _rows_to_end(rows: _Rows, u: Array, width: Array) -> Indices:
+    """How many rows (N,) each point is from where the line ends or jumps.
 
     u : (N,) columns measured, NaN where none was.
     """
     broken = ~(np.abs(np.diff(u)) < 3 * width[1:]) | (np.diff(rows.v) != 1)
-    edge = np.concatenate([[True], broken, [True]])
-    reach = 2 * int(np.ceil(np.median(width))) + 1
-    near = cv2.dilate(edge.astype(np.uint8)[None], np.ones((1, reach), np.uint8))[0]
-    return (near[1:] | near[:-1]).astype(bool)
+    edge = np.flatnonzero(np.concatenate([[True], broken, [True]]))
+    point = np.arange(len(u))
+    after = np.searchsorted(edge, point, side="right")
+    return np.minimum(point - edge[after - 1], edge[after] - 1 - point)
 
 
 def _all(pixels: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:
-    """Which groups (N, M) of columns of (N, columns M) are true in every column."""
-    if columns == 1:
-        return pixels
-    return np.logical_and.reduce([pixels[:, k::columns] for k in range(columns)])
+    """Which groups (M, N) of columns of (N, columns M) are true in every column."""
+    upright = cv2.transpose(pixels.view(np.uint8))
+    if columns > 1:
+        upright = upright.reshape(-1, columns, len(pixels)).min(axis=1)
+    return np.asarray(upright).view(bool)
 
 
 def _lit_by_other(apart: Array, half: int, reach: float) -> NDArray[np.bool_]:
-    """Pixels (N, 2 half + 1) on which the other arm, so far from the middle (N,), shines."""
-    lit = np.zeros((len(apart), 2 * half + 1), bool)
+    """Pixels (2 half + 1, N) on which the other arm, so far from the middle (N,), shines."""
+    lit = np.zeros((2 * half + 1, len(apart)), bool)
     near = np.flatnonzero(np.abs(apart) < half + reach)
-    lit[near] = np.abs(np.arange(-half, half + 1) - apart[near, None]) < reach
+    lit[:, near] = np.abs(np.arange(-half, half + 1)[:, None] - apart[near]) < reach
     return lit
 
 
@@ -316,7 +370,7 @@ def _scatter_over_sigma(line: Line) -> float:
     """By how much points scatter about their neighbours on the line, over their sigmas: speckle is not in these."""
     u, v, variance = line.uv[:, 0], line.uv[:, 1], line.sigma_px**2
     # farther apart than speckle and stones reach
-    lag = max(_LAG_ROWS, round(_LAG_WIDTHS * float(np.median(line.width_px)))) if len(u) else _LAG_ROWS
+    lag = max(_LAG_ROWS, round(_LAG_WIDTHS * median(line.width_px))) if len(u) else _LAG_ROWS
     if len(u) <= 4 * lag + 20:
         return 1.0
     # a fourth difference: curved bottom is no scatter
@@ -329,5 +383,5 @@ def _scatter_over_sigma(line: Line) -> float:
     expected = np.sum([w**2 * variance[part] for w, part in zip(weight, at, strict=True)], axis=0)
     square = off[even] ** 2 / expected[even]
     # median of a squared normal variable: 0.4549 of its variance; speckle has longer tails, which count up to 3 sigma
-    usual = float(np.median(square)) / 0.4549
+    usual = median(square) / 0.4549
     return float(np.clip(np.sqrt(np.minimum(square, 9 * usual).mean() / 0.991), 0.7, 20))

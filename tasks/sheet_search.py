@@ -11,12 +11,11 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ..schemas.calibration import Camera, Laser
 from ..schemas.parameters import LaserParameters
 from .laser_colour import evidence
+from .medians import median
 from .sheet_grid import on_sheets
 
 Array = NDArray[np.float64]
@@ -116,7 +115,8 @@ def reduce(image_bgr: NDArray[np.uint8]) -> Reduced:
     """An image (H, W[, 3]) about 600 pixels wide, of about 300 rows."""
     factor = max(1, round(image_bgr.shape[1] / _WIDTH_PX))
     row_step = max(1, round(image_bgr.shape[0] / _ROWS))
-    rows = image_bgr[(row_step - 1) // 2 :: row_step][: image_bgr.shape[0] // row_step]
+    # rows far apart in memory get into each other's way: copied once, then averaged
+    rows = np.ascontiguousarray(image_bgr[(row_step - 1) // 2 :: row_step][: image_bgr.shape[0] // row_step])
     if factor == 1:
         return Reduced(rows, 1, row_step)
     if factor % 2:
@@ -202,7 +202,7 @@ def _best_box(seen: Floats) -> int:
         if 6 * box > seen.shape[1]:
             break
         height, scatter = _lobes(rows, box)
-        strength.append(float(np.median(height.max(axis=1))) / max(float(np.median(np.abs(scatter[:, ::3]))), 1e-6))
+        strength.append(median(height.max(axis=1)) / max(median(np.abs(scatter[:, ::3])), 1e-6))
     return _BOXES[int(np.argmax(strength))]
 
 
@@ -223,10 +223,11 @@ def _peaks(seen: Floats, box: int, small: Reduced, parameters: LaserParameters) 
 
 def _local_scatter(scatter: Floats) -> Floats:
     """Robust 1-sigma (h, w) of heights around each pixel, not below a third of that of the whole image."""
-    size = np.abs(scatter)
-    usual = max(float(np.median(size[1::6, 1::5])), 1e-5)
+    # of every other row: a mean over 128 pixels is sure enough
+    size = np.abs(scatter[::2])
+    usual = max(median(size[1::3, 1::5]), 1e-5)
     cells = (max(scatter.shape[1] // 16, 8), max(scatter.shape[0] // 16, 8))
-    mean = cv2.resize(np.minimum(size, 4 * usual), cells, interpolation=cv2.INTER_AREA)
+    mean = cv2.resize(np.minimum(size, np.float32(4 * usual)), cells, interpolation=cv2.INTER_AREA)
     # a mean of sizes is 0.8 sigma
     sigma = np.maximum(1.25 * cv2.GaussianBlur(mean, (0, 0), 2.0), 0.5 * usual)
     return np.asarray(cv2.resize(sigma, scatter.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
@@ -271,12 +272,13 @@ def _arm(peaks: Peaks, inverse_depth: Array, usable: Indices, small: Reduced, pa
 
 def _in_columns(peaks: Peaks, inverse_depth: Array, factor: int) -> Array:
     """Place (N,) on the sheet in columns of the reduced image: inverse depth over its change from one to the next."""
-    design = np.column_stack([np.ones(len(peaks.u)), peaks.u, peaks.v])
-    per_px = abs(float(np.linalg.lstsq(design, inverse_depth, rcond=None)[0][1]))
+    few = slice(None, None, max(1, len(peaks.u) // 400))
+    design = np.column_stack([np.ones(len(peaks.u[few])), peaks.u[few], peaks.v[few]])
+    per_px = abs(float(np.linalg.lstsq(design, inverse_depth[few], rcond=None)[0][1]))
     return inverse_depth / max(per_px * factor, 1e-12)
 
 
-def _linked(row: Indices, place: Array, stretch: float) -> NDArray[np.int32]:
+def _linked(row: Indices, place: Array, stretch: float) -> Indices:
     """Number of the chain (N,) that each point is on: points of near rows that are each other's nearest hang together.
 
     Parameters
@@ -300,11 +302,20 @@ def _linked(row: Indices, place: Array, stretch: float) -> NDArray[np.int32]:
         )
         mutual = np.flatnonzero((down >= 0) & (up[down] == np.arange(len(start))))
         below[start[mutual]], above[goal[down[mutual]]] = goal[down[mutual]], start[mutual]
-    top = np.flatnonzero(below >= 0)
-    links = coo_array((np.ones(len(top), np.int8), (top, below[top])), shape=(count, count))
-    chain = np.empty(count, np.int32)
-    chain[order] = connected_components(links, directed=False)[1]
+    chain = np.empty(count, np.intp)
+    chain[order] = _tops(above)
     return chain
+
+
+def _tops(above: Indices) -> Indices:
+    """Number of the topmost point (N,) of each point's chain; above: the next one up, -1 for none."""
+    top = np.where(above < 0, np.arange(len(above)), above)
+    # each round doubles how far a point sees
+    while True:
+        higher = top[top]
+        if np.array_equal(higher, top):
+            return (np.cumsum(above < 0) - 1)[top]
+        top = higher
 
 
 def _without_cliffs(chain: NDArray, row: Indices, place: Array, stretch: float) -> NDArray:
@@ -330,7 +341,7 @@ def _nearest(wanted: Array, key: Array, reach: float) -> Indices:
     if not len(key):
         return np.full(len(wanted), -1)
     place = np.searchsorted(key, wanted)
-    left, right = np.clip(place - 1, 0, len(key) - 1), np.clip(place, 0, len(key) - 1)
+    left, right = np.maximum(place - 1, 0), np.minimum(place, len(key) - 1)
     nearest = np.where(np.abs(key[left] - wanted) < np.abs(key[right] - wanted), left, right)
     return np.where(np.abs(key[nearest] - wanted) <= reach, nearest, -1)
 

@@ -9,6 +9,8 @@ from ..schemas.calibration import Camera, Laser, LaserPlane
 from ..schemas.parameters import LaserParameters
 from . import cross, laser, line_profile, sheet_search
 from .camera import normalised, project, rays
+from .laser_colour import without_grey_channels
+from .medians import median
 from .sheet_grid import on_sheets
 
 Array = NDArray[np.float64]
@@ -176,23 +178,49 @@ def sound(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters
     return _sound_sheets(image_bgr, camera, light, parameters)
 
 
+class Sounded(NamedTuple):
+    """What `on_both_sheets` finds.
+
+    Attributes
+    ----------
+    soundings : the accepted ones.
+    line : all points that were measured.
+    small : the reduced image in which the arms were found.
+    reason : empty, or why there are no soundings.
+    """
+
+    soundings: Soundings
+    line: line_profile.Line
+    small: sheet_search.Reduced
+    reason: str
+
+
+def on_both_sheets(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters) -> Sounded:
+    """Detection, segmentation and triangulation by both sheets at once, of an image of the camera's size."""
+    image = without_grey_channels(image_bgr, parameters.gamma)
+    small = sheet_search.reduce(image)
+    arms = sheet_search.search(small, camera, light, parameters)
+    line = line_profile.measure(image, arms, small.factor, parameters.gamma)
+    if len(line.uv) < parameters.min_soundings:
+        return Sounded(no_soundings(), line, small, "no laser found")
+    soundings = triangulate(camera, light, line.uv, line.arm, line.sigma_px)
+    keep = _apart(camera, light, line) & reject_outliers(soundings, parameters)
+    count = int(np.count_nonzero(keep))
+    if count < parameters.min_soundings:
+        return Sounded(no_soundings(), line, small, _no_cross(len(keep), count))
+    return Sounded(soundings.take(keep), line, small, "")
+
+
 def _sound_sheets(
     image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters
 ) -> ImageSoundings:
-    small = sheet_search.reduce(image_bgr)
-    arms = sheet_search.search(small, camera, light, parameters)
-    line = line_profile.measure(image_bgr, arms, small.factor, parameters.gamma)
-    if len(line.uv) < parameters.min_soundings:
-        return nothing("no laser found")
-    line = line.take(_apart(camera, light, line))
-    soundings = triangulate(camera, light, line.uv, line.arm, line.sigma_px)
-    keep = reject_outliers(soundings, parameters)
-    if keep.sum() < parameters.min_soundings:
-        return nothing(_no_cross(len(keep), int(keep.sum())))
-    soundings = soundings.take(keep)
+    """`on_both_sheets`, and what else is to be known of the light: where it is to be erased, and whether arms agree."""
+    soundings, line, small, reason = on_both_sheets(image_bgr, camera, light, parameters)
+    if reason:
+        return nothing(reason)
     every = slice(None, None, small.row_step)
     whole = cross.whole_line(line.uv[every], line.arm[every], small.row_step, image_bgr.shape[:2])
-    reach = _REACH_SIGMAS * float(np.median(line.width_px))
+    reach = _REACH_SIGMAS * median(line.width_px)
     first, pitch = small.origin_uv, small.pitch_uv
     patch = (3.0, 3.0 * small.factor / small.row_step)
     glow = laser.glow(small.image, (whole - first) / pitch, reach / small.factor, patch) * pitch + first
@@ -268,9 +296,10 @@ def _crossing(arms: list[Array]) -> float | None:
 
 def _value_at_zero(along: Array, depth: Array) -> tuple[float, float]:
     """Depth at 0 of the straight line through points (N,), and its 1-sigma."""
-    design = np.column_stack([np.ones(len(along)), along])
-    value, *_ = np.linalg.lstsq(design, depth, rcond=None)
-    off = (depth - design @ value)[np.argsort(along, kind="stable")]
+    middle, mean = along.mean(), depth.mean()
+    spread = ((along - middle) ** 2).sum()
+    slope = ((along - middle) * (depth - mean)).sum() / max(spread, 1e-18)
+    off = (depth - mean - slope * (along - middle))[np.argsort(along, kind="stable")]
     alike = float(np.clip((off[1:] * off[:-1]).sum() / max((off**2).sum(), 1e-18), 0.0, _MOST_ALIKE))
     scatter = off.std() * np.sqrt((1 + alike) / (1 - alike))
-    return float(value[0]), float(scatter * np.sqrt(np.linalg.inv(design.T @ design)[0, 0]))
+    return float(mean - slope * middle), float(scatter * np.sqrt(1 / len(along) + middle**2 / max(spread, 1e-18)))

@@ -16,7 +16,7 @@ from ..tasks import calibration_board as adjusting
 from ..tasks import calibration_board_start as starting
 from ..tasks import calibration_targets as targets
 from ..tasks.board_shape import heights
-from ..tasks.calibration_lines import cross_on_flat
+from ..tasks.calibration_lines import averaged, cross_on_flat
 from ..tasks.calibration_sheets import as_plane, basis, block, sheet_names, step_jacobian
 from . import calibrate
 from . import calibration_report as report
@@ -82,9 +82,10 @@ def run_board(folder: Path, out: Path, setup: BoardSetup, parameters: Parameters
     free = () if setup.hold_camera else _free(camera.model, len(seen.names))
     found = adjusting.calibrate_board(_data(seen), camera, free, setup.bent)
     result = _calibration(found, setup)
+    written = calibrate.write(out, result, _page(folder, seen, setup, found, free, result))
     if result.laser is None and len(found.sheets):
         _write_planes(out / PLANES, found)
-    return calibrate.write(out, result, _page(folder, seen, setup, found, free, result))
+    return written
 
 
 def _free(model: starting.Model, images: int) -> tuple[str, ...]:
@@ -165,8 +166,7 @@ def _light(bgr: NDArray[np.uint8], corner_uv: Array, setup: BoardSetup, paramete
 
 
 def _data(seen: _Seen) -> adjusting.BoardData:
-    chosen = [starting.thinned(one.uv, one.sheet, one.sigma_px) for one in seen.light]
-    light = [(one.uv[c], one.sheet[c], one.sigma_px[c]) for one, c in zip(seen.light, chosen, strict=True)]
+    light = [averaged(*one) for one in seen.light]
     number = np.arange(len(seen.names))
     return adjusting.BoardData(
         np.concatenate([uv for _, uv in seen.corners]),

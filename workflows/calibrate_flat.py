@@ -34,7 +34,7 @@ def run_flat(
     Raises
     ------
     InvalidInput
-        A mission cannot be used.
+        A mission is wrong, or none can be used; one of several that cannot is left out and named.
     """
     calibrate.prepare(out)
     first = inputs.open_survey(missions[0], start, laser_only=True, level_floor=True)
@@ -42,7 +42,7 @@ def run_flat(
     others = [inputs.open_survey(url, calibration, laser_only=True, level_floor=True) for url in missions[1:]]
     share = max(4, images // len(missions))
     surveys = [survey._replace(rows=inputs.spread(survey.rows, share)) for survey in (first, *others)]
-    data = inputs.flat_data(surveys, [inputs.flat_lines(survey, parameters) for survey in surveys])
+    data, unused = inputs.flat_data(surveys, [inputs.flat_lines(survey, parameters) for survey in surveys])
     found = flat.calibrate_flat(data, calibration, priors, boresight)
     rotation = (*found.boresight_deg.tolist(), calibration.mount.rotation[2])
     sheets = calibrate.Sheets(found.starts, found.sheets, found.steps, found.covariance[:6, :6], found.prior_sigma[:6])
@@ -53,8 +53,9 @@ def run_flat(
             "covariance": calibrate.sheets_and_mount(calibration, sheets, found.covariance, calibrate.MOUNT[:2]),
         }
     )
+    page = _flat_page(missions, data, calibration, priors, boresight, found, sheets, result)
     return calibrate.write(
-        out, result, _flat_page(missions, data, calibration, priors, boresight, found, sheets, result)
+        out, result, page._replace(warnings=(*page.warnings, *(f"left out: {one}" for one in unused)))
     )
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -148,33 +148,49 @@ def _reference(survey: Survey) -> tuple[NDArray, NDArray]:
     return R, prior.poses.C_local[survey.rows] - R @ np.asarray(mount.translation)
 
 
-def _no_altitude(survey: Survey) -> NoReturn:
+def _no_altitude(url: str) -> Problem:
     found, expected = "no altitude near the time of an image", "an altimeter: the laser's scale is measured against it"
-    remedy = "Fill the column altitude of the navigation."
-    raise InvalidInput([Problem(survey.url, None, "navigation", found, expected, remedy)])
+    return Problem(url, None, "navigation", found, expected, "Fill the column altitude of the navigation.")
 
 
-def flat_data(surveys: list[Survey], lines: list[list[Lines]]) -> FlatData:
-    """Points and navigation of one mission or more, images with both lines only."""
-    parts = []
-    for number, (survey, found) in enumerate(zip(surveys, lines, strict=True)):
-        R, X = _reference(survey)
-        prior = survey.made.prior
-        assert prior is not None
-        keep = np.array([len(one.uv) > 0 for one in found], bool) & np.isfinite(X).all(1)
-        if keep.sum() < _LEAST_IMAGES:
-            shown, remedy = f"{keep.sum()} images with both lines", "Check that the laser was on and the floor is flat."
-            raise InvalidInput([Problem(survey.url, None, "images", shown, f"at least {_LEAST_IMAGES}", remedy)])
-        altitude = survey.opened.frames["altitude"].values.astype(float)[survey.rows]
-        if not np.isfinite(altitude).any():
-            _no_altitude(survey)
-        tilt = prior.sigma_attitude[survey.rows][:, :2].mean(1)
-        # each mission has a local frame of its own, and a floor of its own
-        columns = R, X, altitude, np.full(len(X), number), prior.sigma_depth[survey.rows], tilt
-        parts.append(([one for one, ok in zip(found, keep, strict=True) if ok], [c[keep] for c in columns]))
-    told = [one for one_mission, _ in parts for one in one_mission]
-    uv, image, arm, sigma = gather(told)
-    return FlatData(uv, image, arm, sigma, *[np.concatenate(c) for c in zip(*[c for _, c in parts], strict=True)])
+def flat_data(surveys: list[Survey], lines: list[list[Lines]]) -> tuple[FlatData, list[Problem]]:
+    """Points and navigation of one mission or more, images with both lines only; and what is wrong with the others.
+
+    Raises
+    ------
+    InvalidInput
+        No mission can be used.
+    """
+    parts, problems = [], []
+    for survey, found in zip(surveys, lines, strict=True):
+        part = _over_floor(survey, found)
+        (problems if isinstance(part, Problem) else parts).append(part)
+    if not parts:
+        raise InvalidInput(problems)
+    for problem in problems:
+        log.warning("step=calibrate left out: %s", problem)
+    # each mission has a local frame of its own, and a floor of its own
+    number = np.repeat(np.arange(len(parts)), [len(told) for told, _ in parts])
+    R, X, altitude, depth, tilt = (np.concatenate(c) for c in zip(*[c for _, c in parts], strict=True))
+    uv, image, arm, sigma = gather([one for told, _ in parts for one in told])
+    return FlatData(uv, image, arm, sigma, R, X, altitude, number, depth, tilt), problems
+
+
+def _over_floor(survey: Survey, found: list[Lines]) -> tuple[list[Lines], list[NDArray]] | Problem:
+    """Lines and navigation of a mission's images with both lines, or why it is of no use."""
+    R, X = _reference(survey)
+    prior = survey.made.prior
+    assert prior is not None
+    keep = np.array([len(one.uv) > 0 for one in found], bool) & np.isfinite(X).all(1)
+    if keep.sum() < _LEAST_IMAGES:
+        shown, remedy = f"{keep.sum()} images with both lines", "Check that the laser was on and the floor is flat."
+        return Problem(survey.url, None, "images", shown, f"at least {_LEAST_IMAGES}", remedy)
+    altitude = survey.opened.frames["altitude"].values.astype(float)[survey.rows]
+    if not np.isfinite(altitude[keep]).any():
+        return _no_altitude(survey.url)
+    tilt = prior.sigma_attitude[survey.rows][:, :2].mean(1)
+    columns = R, X, altitude, prior.sigma_depth[survey.rows], tilt
+    return [one for one, ok in zip(found, keep, strict=True) if ok], [c[keep] for c in columns]
 
 
 def _reference_at(survey: Survey, opened: OpenedMission) -> tuple[NDArray, NDArray]:
@@ -228,13 +244,13 @@ def altimeter(survey: Survey) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     known = np.isfinite(samples.altitude) & np.isfinite(slow.depth) & np.isfinite(slow.latitude)
     ns, altitude = ns[known], samples.altitude[known]
     if not len(ns):
-        _no_altitude(survey)
+        raise InvalidInput([_no_altitude(survey.url)])
     after = np.clip(np.searchsorted(start, ns), 1, max(1, len(start) - 1))
     before_nearer = np.abs(ns - start[after - 1]) <= np.abs(ns - start[np.minimum(after, len(start) - 1)])
     image = np.where(before_nearer, after - 1, np.minimum(after, len(start) - 1))
     near = np.abs(ns - start[image]) < _NEAR_S * 1e9
     if not near.any():
-        _no_altitude(survey)
+        raise InvalidInput([_no_altitude(survey.url)])
     image, ns, altitude = image[near], ns[near], altitude[near]
     frame = survey.made.frame
     place = [getattr(slow, name)[known][near] for name in ("longitude", "latitude", "depth")]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from seamosaic.schemas.parameters import LaserParameters
-from seamosaic.tasks import laser_colour, triangulation
+from seamosaic.tasks import laser_colour, medians, triangulation
 
 from tests.tasks.laser_scenes import COLOUR, LIGHT, WHITE, camera, columns, encoded
 from tests.tasks.test_laser_hostile import bottom
@@ -50,11 +50,14 @@ def test_evidence_has_the_laser_and_not_the_texture():
     apart = np.arange(300) != 150
     assert np.median(seen[:, 150]) - np.median(seen) == pytest.approx(0.2, abs=0.02)
     assert 0.001 < seen[:, apart].std() < 0.1 * texture[..., 1].std()
-    same = laser_colour.evidence(np.repeat(image[..., 1:2], 3, axis=2), 2.2)
+    assert laser_colour.without_grey_channels(image, 2.2) is image
+    grey = laser_colour.without_grey_channels(np.repeat(image[..., 1:2], 3, axis=2), 2.2)
+    np.testing.assert_array_equal(grey, image[..., 1])
+    same = laser_colour.evidence(grey, 2.2)
     np.testing.assert_allclose(same, laser_colour.linear_light(2.2)[image[..., 1]], atol=1e-6)
 
 
 def test_running_median_keeps_to_most():
     height = np.full(200, 0.3)
     height[50:58] = 3.0
-    assert laser_colour.running_median(height) == pytest.approx(0.3, rel=0.05)
+    assert medians.running_median(height) == pytest.approx(0.3, rel=0.05)

@@ -69,8 +69,8 @@ def torch(light: np.ndarray) -> np.ndarray:
     return light + 2.5 * spot[..., None] * np.array([0.9, 1.0, 0.9])
 
 
-def bubbles(light: np.ndarray) -> np.ndarray:
-    rng, out = np.random.default_rng(3), light.copy()
+def bubbles(light: np.ndarray, seed: int = 3) -> np.ndarray:
+    rng, out = np.random.default_rng(seed), light.copy()
     for _ in range(120):
         place = (int(rng.integers(0, VIEW.width)), int(rng.integers(0, VIEW.height)))
         radius = int(rng.integers(3, 22))
@@ -89,6 +89,41 @@ def test_torch_and_bubbles(disturb):
     assert share_wrong(found, made) <= 0.001
 
 
+def grey(image: np.ndarray) -> np.ndarray:
+    return np.repeat(image[..., 1:2], 3, axis=2)
+
+
+def test_torch_in_grey():
+    assert sounded(grey(with_noise(torch(bottom())))).reason == "no laser found"
+    made = scene(25)
+    found = sounded(grey(encoded(torch((made.image / 255.0) ** 2.2))))
+    assert len(found.soundings.uv) > 500
+    assert share_wrong(found, made) <= 0.001
+
+
+@pytest.mark.parametrize("snr", [10, 25])
+def test_bubbles_in_grey_where_shape_alone_tells(snr: float):
+    wrong, count = 0.0, 0
+    for seed in range(200, 204):
+        assert sounded(grey(with_noise(bubbles(bottom(seed), seed), seed))).reason == "no laser found"
+        made = scene(snr, seed)
+        found = sounded(grey(encoded(bubbles((made.image / 255.0) ** 2.2, seed))))
+        count += len(found.soundings.uv)
+        wrong += share_wrong(found, made) * len(found.soundings.uv)
+    assert count > 4 * 500
+    assert wrong <= 0.001 * count
+
+
+def test_two_crosses_in_grey_give_the_brighter():
+    made = scene(25)
+    other = columns(VIEW, 2.2, 0.0)
+    ghost = sum(np.exp(-0.5 * ((np.arange(VIEW.width) - other[k][:, None]) / 2.5) ** 2) for k in (0, 1))
+    image = np.maximum(with_noise(0.25 * WHITE + 0.1 * np.asarray(ghost)[..., None] * COLOUR), made.image)
+    found = sounded(grey(image))
+    assert len(found.soundings.uv) > 600
+    assert share_wrong(found, made) < 0.001
+
+
 def test_grey_images_are_measured():
     made = scene(20)
     grey = np.ascontiguousarray(made.image[..., 1])
@@ -101,10 +136,11 @@ def test_grey_images_are_measured():
 
 def test_sixteen_bit_png_is_measured():
     made = scene(20)
-    content = cv2.imencode(".png", made.image.astype(np.uint16) * 257)[1].tobytes()
-    found = sounded(decode(content, VIEW))
-    assert len(found.soundings.uv) > 900
-    assert share_wrong(found, made) < 0.001
+    for image in (made.image, made.image[..., 1]):
+        content = cv2.imencode(".png", image.astype(np.uint16) * 257)[1].tobytes()
+        found = sounded(decode(content, VIEW))
+        assert len(found.soundings.uv) > 900
+        assert share_wrong(found, made) < 0.001
 
 
 def test_another_size_is_refused():

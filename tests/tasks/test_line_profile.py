@@ -101,7 +101,7 @@ def test_fit_of_single_profiles(width: float):
     light = 0.5 * np.exp(-0.5 * ((x - place[:, None]) / width) ** 2) + rng.normal(0, 0.01, (600, 29))
     used = np.ones(light.shape, bool)
     used[::4, 14] = False
-    found = gaussian_fit.fit(light.T.astype(np.float32), used.T, 1.2 * width, 1e-6)
+    found = gaussian_fit.fit(light.T.astype(np.float32), used.T.astype(np.float32), 1.2 * width, 1e-6)
     assert np.abs(found.width / width - 1).max() < 0.05
     assert 0.8 < (found.place - place).std() / (1.0623 * np.sqrt(width) / 50) < 1.4
     assert 0.75 < ((found.place - place) / found.sigma).std() < 1.15
@@ -112,9 +112,9 @@ def test_fit_of_single_profiles(width: float):
 def test_ground_is_a_line_through_both_sides():
     x = np.arange(-20, 21, dtype=np.float32)
     light = np.tile(0.2 + 0.003 * x[:, None], 50)
-    used = np.ones(light.shape, bool)
+    used = np.ones(light.shape, np.float32)
     np.testing.assert_allclose(gaussian_fit.ground(light, used, 2.0), light, atol=1e-5)
-    used[x > 0] = False
+    used[x > 0] = 0
     one_sided = gaussian_fit.ground(light, used, 2.0)
     assert np.ptp(one_sided) < 1e-6
     assert not gaussian_fit.ground(light, np.zeros_like(used), 2.0).any()

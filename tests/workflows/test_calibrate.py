@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from seamosaic.schemas.calibration import LaserPlane
 from seamosaic.schemas.problems import InvalidInput
-from seamosaic.tasks.calibration_sheets import altitude_error, basis, sensitivity, step_jacobian
+from seamosaic.tasks.calibration_sheets import altitude_error, angle_deg, basis, sensitivity, step_jacobian
 from seamosaic.workflows.calibrate_inputs import read_calibration
 from seamosaic.workflows.cli import app
 from typer.testing import CliRunner
@@ -40,8 +41,10 @@ def worst_percent(mission: Path, found: Path, altitude_m: float) -> float:
 def test_flat(tmp_path: Path):
     survey = {"lines": 3, "altitude_m": 1.8, "altitude_step_m": 0.6, "overlap": 0.4, "sidelap": 0.6}
     mission = small_mission(tmp_path / "floor", "floor", images=12, survey=survey)
+    few = small_mission(tmp_path / "few", "floor", images=3)
     start, out = start_of(mission, tmp_path), tmp_path / "out"
-    done = CliRunner().invoke(app, ["calibrate", "flat", str(mission), "--start", str(start), "-o", str(out)])
+    both = [str(mission), str(few)]
+    done = CliRunner().invoke(app, ["calibrate", "flat", *both, "--start", str(start), "-o", str(out)])
     assert done.exit_code == 0, done.output
     assert worst_percent(mission, start, 2.4) > 0.3
     assert worst_percent(mission, out / "calibration.yaml", 2.4) < 0.25
@@ -50,6 +53,7 @@ def test_flat(tmp_path: Path):
     assert "mount.rotation.roll" in block.parameters
     assert np.linalg.eigvalsh(np.array(block.matrix)).min() > -1e-12
     page = (out / "calibration-report.html").read_text()
+    assert f"left out: {few}: images: found 3 images with both lines" in page
     assert "Leave-one-out" in page
     assert page.count("data:image/png") == 3
     assert "http" not in page.replace("http-equiv", "")
@@ -139,6 +143,28 @@ def test_board(tmp_path: Path):
     page = (out / "calibration-report.html").read_text()
     assert "Left-out light" in page
     assert page.count("data:image/png") == 3
+
+
+def test_lines_that_do_not_cross(tmp_path: Path):
+    """Two lines and a new folder: the camera in calibration.yaml, the sheets beside it in planes.yaml."""
+    true, lean = calibration(), np.radians(5)
+    assert true.laser is not None
+    planes = tuple(
+        LaserPlane(name=name, normal=(float(np.cos(lean)), 0.0, float(np.sin(lean))), offset=offset)
+        for name, offset in (("a", 0.12), ("b", 0.21))
+    )
+    light = true.laser.model_copy(update={"planes": planes})
+    write_photographs(tmp_path / "photographs", true.model_copy(update={"laser": light}), board_poses(4, 1))
+    out = tmp_path / "new" / "out"
+    arguments = ["calibrate", "board", str(tmp_path / "photographs"), "-o", str(out), "--lines", "2"]
+    done = CliRunner().invoke(app, [*arguments, "--columns", "9", "--rows", "6", "--square-mm", "60"])
+    assert done.exit_code == 0, done.output
+    assert read_calibration(out / "calibration.yaml").laser is None
+    found = yaml.safe_load((out / "planes.yaml").read_text())["planes"]
+    assert len(found) == 2
+    for one, plane in zip(found, planes, strict=True):
+        assert 0.0001 < angle_deg(one["normal"], plane.normal) < 0.3
+        assert abs(abs(one["offset"]) - plane.offset) < 0.005
 
 
 def truth_in_sigmas(mission: Path, found: Path) -> np.ndarray:
