@@ -28,6 +28,18 @@ def start(described: Cluster) -> Running:
     return cluster
 
 
+def replace_dead(cluster: Running, wanted: int, before: frozenset) -> frozenset:
+    """Start the workers of this machine that are missing now and were before; names of those to be missed next time.
+
+    A nanny starts its worker again, but gives up if that is killed while it starts, and nobody takes its place.
+    """
+    missing = frozenset(cluster.worker_spec) - frozenset(cluster.workers)
+    if missing & before:
+        cluster.scale(wanted)  # which looks at what is there
+        return frozenset()  # they take a while to start
+    return missing
+
+
 def local(workers: int | None) -> Cluster:
     """One worker a core, or so many."""
     return Cluster(kind="local", workers=workers or os.cpu_count() or 1)

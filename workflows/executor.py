@@ -1,5 +1,6 @@
 """Where Dask runs the graph: threads of this process, a cluster of its own, or a cluster elsewhere."""
 
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -9,7 +10,7 @@ import dask.config
 from dask.base import compute
 from dask.callbacks import Callback
 from dask.delayed import Delayed
-from distributed import Client, Future, KilledWorker, as_completed
+from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
 from distributed.comm.core import CommClosedError
 
 from ..schemas.cluster import Cluster
@@ -29,7 +30,7 @@ _SETTINGS = {
     "distributed.comm.timeouts.tcp": "300s",
     "distributed.scheduler.allowed-failures": _DEATHS,
 }
-_HELLO_S, _REMIND_S = "15s", 60.0
+_HELLO_S, _LOOK_S, _REMIND = "15s", 5.0, 12
 
 
 class ClusterLost(RuntimeError):
@@ -88,11 +89,7 @@ class ClusterExecutor:
             raise InvalidInput(problems)
 
     def _wait(self) -> None:
-        said = 0.0
         while not self.client.scheduler_info(n_workers=-1)["workers"]:
-            if time.monotonic() - said > _REMIND_S:
-                said = time.monotonic()
-                log.info("step=%s no worker is there yet; waiting", "workers")
             time.sleep(0.2)
 
     def compute(self, tasks: Sequence[Delayed], advance: Progress) -> list[Any]:
@@ -160,16 +157,44 @@ def open_executor(scheduler: str | None, workers: int | None, cluster: Cluster |
     if scheduler in ("sync", "threads"):
         yield LocalExecutor(scheduler, clusters.local(workers).workers or 1)
     elif scheduler is None:
-        with clusters.start(cluster or clusters.local(workers)) as running, Client(running) as client:
-            yield _announced(client)
+        described = cluster or clusters.local(workers)
+        with clusters.start(described) as running, Client(running) as client:
+            own = running if isinstance(running, LocalCluster) and described.adapt is None else None
+            with _watched(client, own, described.workers or 1):
+                yield _announced(client)
     else:
         client = _connect(scheduler)
         try:
             client.run_on_scheduler(_tolerant(_DEATHS))
-            yield _announced(client)
+            with _watched(client):
+                yield _announced(client)
         finally:
             with suppress(OSError, TimeoutError, RuntimeError):
                 client.close()
+
+
+@contextmanager
+def _watched(client: Client, own: LocalCluster | None = None, wanted: int = 0) -> Iterator[None]:
+    """Say when there is no worker for a while, and replace those of this machine that nobody else does."""
+    ended, dead, missed = threading.Event(), frozenset(), 0
+
+    def watch() -> None:
+        nonlocal dead, missed
+        while not ended.wait(_LOOK_S):
+            with suppress(OSError, TimeoutError, RuntimeError):  # the run itself will say what is wrong
+                if own is not None:
+                    dead = clusters.replace_dead(own, wanted, dead)
+                missed = 0 if client.scheduler_info(n_workers=-1)["workers"] else missed + 1
+                if missed and missed % _REMIND == 0:
+                    log.warning("step=%s there is no worker; waiting for one", "cluster")
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def _announced(client: Client) -> ClusterExecutor:

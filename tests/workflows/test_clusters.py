@@ -1,12 +1,16 @@
 """Cluster files: what they may say, and the jobs that they make."""
 
+import os
+import signal
 import sys
+import time
 
 import pytest
+from dask.delayed import delayed
 from seamosaic.schemas.cluster import Cluster
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.yaml_input import load_model
-from seamosaic.workflows import clusters
+from seamosaic.workflows import clusters, executor
 
 SLURM = """\
 kind: slurm
@@ -55,6 +59,23 @@ def test_a_local_cluster_has_its_workers(tmp_path):
         (worker,) = cluster.workers.values()
         assert (worker.nthreads, worker.memory_manager.memory_limit) == (1, 2 * 1024**3)
     assert list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_worker_killed_while_it_starts_again_is_replaced(monkeypatch):
+    """Its nanny starts no third one: the run would wait for ever."""
+    monkeypatch.setattr(executor, "_LOOK_S", 0.2)
+    with executor.open_executor(None, 1) as running:
+        assert isinstance(running, executor.ClusterExecutor)
+        (nanny,) = running.client.cluster.workers.values()
+        first = nanny.pid
+        os.kill(first, signal.SIGKILL)
+        deadline = time.monotonic() + 60
+        while nanny.pid in (None, first):
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        os.kill(nanny.pid, signal.SIGKILL)
+        assert running.compute([delayed(abs)(-1)], lambda _: None) == [1]
 
 
 @pytest.mark.parametrize(
