@@ -5,6 +5,7 @@ keeps the leases. If it is killed, its children end, and the leases lapse.
 """
 
 import multiprocessing
+import os
 import signal
 import sys
 import threading
@@ -132,7 +133,7 @@ class _Child:
         self.state, self.lost, self._held, self._archive = state, lost, held, archive
         self._started = time.monotonic()
         self._answers, sender = context.Pipe(duplex=False)
-        given = (sender, state.url, archive.products, state.parameters, options)
+        given = (sender, state.url, archive.products, state.parameters, options, dict(os.environ))
         self.process = context.Process(target=_work, args=given, name=state.id)  # type: ignore[attr-defined]
         self.process.start()
         sender.close()
@@ -152,6 +153,7 @@ class _Child:
             answer = self._answers.recv()
         except EOFError:
             answer = (FAILED, _fate(self.process.exitcode))
+        self._answers.close()
         if self.lost.is_set():
             answer = (FAILED, "another run took over its lease; see that this machine's clock is right")
         with self._held:
@@ -222,8 +224,11 @@ def _begin(archive: OpenedArchive, state: MissionState, options: Options) -> _Ch
         return _Child(archive, now, options, held.pop_all(), lease.lost)
 
 
-def _work(answers: Connection, url: str, products: str, parameters: Parameters, options: Options) -> None:
+def _work(
+    answers: Connection, url: str, products: str, parameters: Parameters, options: Options, environment: dict[str, str]
+) -> None:
     """Process one mission; the answer is ("done", version, new, computed, reused) or (failed or invalid, why)."""
+    os.environ.update(environment)  # the server that forks has that of its start
     from . import run as runner
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # a cluster is taken down on the way

@@ -48,7 +48,7 @@ def ask(inputs: str, parameters: Parameters, code: Mapping[str, str]) -> Request
 
 def provenance(version: Version) -> dict[str, Any]:
     """provenance.json of a version; empty if it cannot be read."""
-    found = json_files.read_json(f"{version.path}/{versions.PROVENANCE.as_posix()}")
+    found = json_files.read_json(f"{version.path}/{versions.PROVENANCE}")
     return found if isinstance(found, dict) else {}
 
 

@@ -215,6 +215,7 @@ def test_bad_missions_do_not_stop_good_ones(archive):
 def test_a_failure_is_told_and_tried_again(archive, tiny_mission):
     """One mission has noise for images; the other's process is killed, as a system out of memory does."""
     shutil.rmtree(archive / "products/plane-0")
+    write(archive)  # one at a time
     shutil.rmtree(archive / "missions/m01")
     tiny_mission.rename(archive / "missions/tiny")
     killer = threading.Thread(target=_kill_a_mission, args=(archive / "products/plane-0/steps",))
