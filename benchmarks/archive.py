@@ -17,6 +17,7 @@ from seamosaic.catalog import memory
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.workflows import request
 from seamosaic.workflows.run import CODE
+
 from tests.conftest import CALIBRATION, MISSION, START
 
 

@@ -81,7 +81,7 @@ def _wrong(path: Path, key: str, found: str, expected: str, remedy: str) -> Inva
 
 
 def _open(folder: Path, opened: ExitStack) -> _Side:
-    names = "bathymetry.tif", "uncertainty.tif", "trajectory.csv", str(versions.PROVENANCE)
+    names = "bathymetry.tif", "uncertainty.tif", "trajectory.csv", versions.PROVENANCE
     missing = [name for name in names if not (folder / name).is_file()]
     if missing:
         remedy = "Give two folders such as products/<mission id>/v1 and v2."
