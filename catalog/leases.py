@@ -80,20 +80,21 @@ class Lease:
         self._ended.set()
         self._thread.join()
         with suppress(OSError):  # what cannot be given back lapses
-            if self._is_ours():
+            if self.is_ours():
                 json_files.remove(self.url)
 
     def _beat(self) -> None:
         term, renewed = self.holder.term_s, time.monotonic()
         while not self._ended.wait(term / _BEATS_A_TERM):
             with suppress(OSError):
-                if time.monotonic() - renewed > term or not self._is_ours():
+                if time.monotonic() - renewed > term or not self.is_ours():
                     self.lost.set()
                     return
                 json_files.write_json(self.url, self.holder._replace(heartbeat=time.time())._asdict())
                 renewed = time.monotonic()
 
-    def _is_ours(self) -> bool:
+    def is_ours(self) -> bool:
+        """Whether it has not been taken by another."""
         found = _read(self.url)
         return found is not None and found.token == self.holder.token
 
@@ -132,15 +133,16 @@ def _take(folder: str, purpose: str, term_s: float, shared: bool) -> Lease:
     _refuse(present, lambda one: not shared or one.purpose == "prune")
     number = max((number for number, _ in present), default=0) + 1
     url = f"{folder}/{number}.json"
-    try:
-        json_files.write_json(url, ours._asdict(), new=True)
-    except FileExistsError:
-        raise Busy(_read(url)) from None
     lease = Lease(url, ours)
     try:
+        json_files.write_json(url, ours._asdict(), new=True)
         _confirm(lease, folder, shared)
-    except BaseException:
-        json_files.remove(url)
+    except FileExistsError:
+        raise Busy(_read(url)) from None
+    except BaseException:  # also a signal that comes in between
+        with suppress(OSError):
+            if lease.is_ours():
+                json_files.remove(url)
         raise
     return lease
 

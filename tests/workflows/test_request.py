@@ -6,12 +6,15 @@ import sys
 
 import pytest
 from seamosaic.catalog import memory, missions, records
+from seamosaic.catalog.images import MissingImage
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.workflows import job, products, request, run
 
 # What carries results but does not decide them
 NEUTRAL = {
     *(f"catalog.{name}" for name in ("json_files", "leases", "records", "store", "versions")),
+    *(f"catalog.{name}" for name in ("filesystems", "publishing", "runs")),
+    *("schemas.cluster", "workflows.clusters", "workflows.footing"),
     *(f"schemas.{name}" for name in ("base", "expectation", "parameters", "problems", "products", "provenance")),
     *(f"workflows.{name}" for name in ("executor", "job", "progress", "request", "session")),
 }
@@ -80,7 +83,7 @@ def test_an_image_that_could_not_be_read_just_then_is_tried_again(reef, tmp_path
 
     def once_broken(url, path, *rest):
         if path.endswith(first):
-            raise OSError("the disk is tired")
+            raise MissingImage("the disk is tired")
         return read(url, path, *rest)
 
     first = sorted((reef.mission / "images").iterdir())[0].name
