@@ -125,17 +125,22 @@ def _publish(archive: OpenedArchive, state: MissionState) -> None:
 
 
 class _Child:
-    """A mission being processed."""
+    """A mission being processed. held : what is given back when it ends."""
 
-    def __init__(self, archive: OpenedArchive, state: MissionState, options: Options, held: ExitStack, lost: Any):
+    def __init__(self, archive: OpenedArchive, state: MissionState, options: Options, lost: threading.Event):
         assert state.parameters is not None
         context = multiprocessing.get_context(_METHOD)
-        self.state, self.lost, self._held, self._archive = state, lost, held, archive
+        self.state, self.lost, self.held, self._archive = state, lost, ExitStack(), archive
         self._started = time.monotonic()
         self._answers, sender = context.Pipe(duplex=False)
         given = (sender, state.url, archive.products, state.parameters, options, dict(os.environ))
         self.process = context.Process(target=_work, args=given, name=state.id)  # type: ignore[attr-defined]
-        self.process.start()
+        try:
+            self.process.start()
+        except BaseException:  # a signal, as starting the first takes seconds
+            if self.process.pid is not None:
+                self.process.terminate()
+            raise
         sender.close()
 
     def stop(self) -> None:
@@ -143,7 +148,7 @@ class _Child:
         self.process.join(_PATIENCE_S)
         self.process.kill()
         self.process.join()
-        self._held.close()
+        self.held.close()
 
     def outcome(self) -> Outcome:
         """What became of it, once its process has ended; written down and published."""
@@ -156,7 +161,7 @@ class _Child:
         self._answers.close()
         if self.lost.is_set():
             answer = (FAILED, "another run took over its lease; see that this machine's clock is right")
-        with self._held:
+        with self.held:
             try:
                 return self._settle(answer, seconds)
             except OSError as error:
@@ -221,7 +226,9 @@ def _begin(archive: OpenedArchive, state: MissionState, options: Options) -> _Ch
         now = archive_states.assess(archive, state.url, ours=True)
         if now.state not in TO_DO:
             return _settled(archive, now)
-        return _Child(archive, now, options, held.pop_all(), lease.lost)
+        child = _Child(archive, now, options, lease.lost)
+        child.held = held.pop_all()  # only now: whatever happens before gives the lease back
+        return child
 
 
 def _work(
