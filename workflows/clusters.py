@@ -1,6 +1,7 @@
 """Clusters that a run starts and ends itself: processes of this machine, or jobs of Slurm or PBS."""
 
 import os
+from contextlib import suppress
 from typing import Any
 
 from distributed import LocalCluster
@@ -10,6 +11,7 @@ from ..schemas.cluster import Cluster
 from ..schemas.problems import InvalidInput, Problem
 
 _FREE_PORT = ":0"
+_STARTS = 5
 
 
 def start(described: Cluster) -> Running:
@@ -54,6 +56,9 @@ def _local(described: Cluster) -> LocalCluster:
     }
     if described.memory is not None:
         options["memory_limit"] = described.memory
+    for _ in range(_STARTS - 1):
+        with suppress(RuntimeError):  # of a worker that was killed while it started
+            return LocalCluster(**options)
     return LocalCluster(**options)
 
 

@@ -31,7 +31,7 @@ def workers(s3: S3, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def uploaded(s3: S3, mission: Path, name: str) -> str:
-    s3fs.S3FileSystem().put(str(mission), f"{s3.bucket}/{name}", recursive=True)
+    s3fs.S3FileSystem(use_listings_cache=False).put(str(mission), f"{s3.bucket}/{name}", recursive=True)
     return s3.url(name)
 
 
@@ -45,7 +45,7 @@ def test_two_workers_without_a_shared_disk_give_what_one_thread_gives(reef, s3, 
     result = run(mission, s3.url("maps"), Parameters(), scheduler=workers)
     assert (str(result.path), result.new) == (s3.url("maps", result.quality.mission.id, "v1"), True)
     assert differing(downloaded(result.path, tmp_path / "v1"), reef.result.path) == []
-    fs = s3fs.S3FileSystem()
+    fs = s3fs.S3FileSystem(use_listings_cache=False)
     left = [path for path in fs.find(f"{s3.bucket}/maps") if "/.tmp/" in path or "/.claims/" in path]
     assert left == []
     again = run(mission, s3.url("maps"), Parameters(), scheduler=workers)
