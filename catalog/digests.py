@@ -2,14 +2,13 @@
 
 import hashlib
 import io
-import json
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, BinaryIO, NamedTuple, cast
 
 from fsspec import AbstractFileSystem
 
-from .filesystems import ObjectStoreError, asking, connect, write_whole
+from .filesystems import ObjectStoreError, asking
 from .image_headers import HEADER_BYTES, TAIL_BYTES, Header, read_header
 
 _BLOCK = 4 * 1024 * 1024
@@ -36,29 +35,6 @@ def sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def recall(out: str, mission: str) -> dict[str, Any]:
-    """What earlier runs into OUT learnt of a mission's images; empty if there is none, or it cannot be read."""
-    fs, path = connect(_memory(out, mission))
-    try:
-        with asking(fs, out):
-            known = json.loads(fs.cat_file(path))
-    except ObjectStoreError:
-        raise
-    except (OSError, ValueError):
-        return {}
-    return known if isinstance(known, dict) else {}
-
-
-def remember(out: str, mission: str, known: Mapping[str, Any]) -> None:
-    """Keep what was learnt of a mission's images for the next run into OUT."""
-    write_whole(_memory(out, mission), json.dumps(known).encode(), f"{out}/.image-digests")
-
-
-def _memory(out: str, mission: str) -> str:
-    """A file for each mission: those of others are not read, and runs at once do not take turns."""
-    return f"{out}/.image-digests/{sha256(mission.encode())[:16]}.json"
-
-
 def inspect_images(
     fs: AbstractFileSystem, files: Sequence[tuple[str, Mapping[str, Any]]], known: MutableMapping[str, Any] | None
 ) -> list[Inspection]:
@@ -71,7 +47,7 @@ def inspect_images(
         of plain values, so that it can be kept as JSON. None to read everything.
     """
     known = {} if known is None else known
-    keys = [_key(path, info) for path, info in files]
+    keys = [file_key(path, info) for path, info in files]
     unread = [i for i, key in enumerate(keys) if key is None or key not in known]
     read = dict(zip(unread, _all(_inspect, fs, [files[i][0] for i in unread]), strict=True))
     for i, inspection in read.items():
@@ -79,6 +55,11 @@ def inspect_images(
         if key is not None and inspection.sha256:
             known[key] = [inspection.sha256, list(inspection.header)]
     return [read[i] if i in read else _recall(known[str(key)]) for i, key in enumerate(keys)]
+
+
+def are_known(files: Sequence[tuple[str, Mapping[str, Any]]], known: Mapping[str, Any] | None) -> bool:
+    """Whether `inspect_images` would have to read none of these files."""
+    return all(file_key(path, info) in (known or {}) for path, info in files)
 
 
 def peek_images(fs: AbstractFileSystem, files: Sequence[tuple[str, Mapping[str, Any]]]) -> list[Inspection]:
@@ -97,8 +78,8 @@ def _recall(value: Sequence[Any]) -> Inspection:
     return Inspection(value[0], Header(*value[1]))
 
 
-def _key(path: str, info: Mapping[str, Any]) -> str | None:
-    """Path, size and time of change; None if the file system does not tell the latter."""
+def file_key(path: str, info: Mapping[str, Any]) -> str | None:
+    """Path, size and time of change of a file; None if the file system does not tell the latter."""
     modified = next((info[name] for name in _MODIFIED if info.get(name) is not None), None)
     return None if modified is None else f"{path}|{info.get('size')}|{modified}"
 

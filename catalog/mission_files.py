@@ -9,7 +9,7 @@ from fsspec import AbstractFileSystem
 from ..schemas.mission import Mission
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.yaml_document import Document
-from .digests import sha256
+from .digests import file_key, sha256
 from .filesystems import ObjectStoreError, asking, connect, is_remote
 
 _MAGIC = "*?["
@@ -85,6 +85,10 @@ class MissionFiles:
         fixed = next((i for i, part in enumerate(parts) if any(sign in part for sign in _MAGIC)), len(parts) - 1)
         found = self._files("/".join(parts[:fixed]), None if "**" in parts else len(parts) - fixed)
         return {name: entry for name, entry in sorted(found.items()) if _matches(name.split("/"), parts)}
+
+    def keys(self) -> dict[str, str | None]:
+        """Path, size and time of change of every file, as of now, by relative path; None where that is not told."""
+        return {name: file_key(path, info) for name, (path, info) in self._files("", None).items()}
 
     def folder_of(self, pattern: str) -> list[str]:
         """Names of the files in the folder in which a pattern looks, for a message."""

@@ -9,6 +9,7 @@ import errno
 import hashlib
 import io
 import json
+import os
 import struct
 import time
 import zipfile
@@ -84,6 +85,13 @@ class Store(NamedTuple):
                 return _read_info(archive)[1]
 
         return _unless_damaged(fs, path, read)
+
+    def touch(self, step: str, key: str) -> None:
+        """Note that a result was used, for `pruning`; an object store knows only when it was made."""
+        fs, path = connect(self.path(step, key))
+        if isinstance(fs, LocalFileSystem):
+            with contextlib.suppress(OSError):
+                os.utime(path)
 
     def remove(self, step: str, key: str) -> None:
         """Forget a result, so that the next run makes it again."""

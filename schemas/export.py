@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+from .archive import Archive
 from .base import Model
 from .calibration import Calibration
 from .cluster import Cluster
@@ -14,6 +15,7 @@ from .provenance import Provenance
 FOLDER = Path(__file__).parent / "json"
 
 MODELS: dict[str, type[Model]] = {
+    "archive": Archive,
     "mission": Mission,
     "calibration": Calibration,
     "parameters": Parameters,

@@ -1,4 +1,7 @@
-"""The `seamosaic` command. Exit codes: 0 done, 1 failed, 2 invalid input, 130 interrupted, 143 ended by SIGTERM."""
+"""The `seamosaic` command.
+
+Exit codes: 0 done, 1 failed (of an archive: any mission), 2 invalid input, 130 interrupted, 143 ended by SIGTERM.
+"""
 
 import errno
 import json
@@ -13,8 +16,19 @@ from rich.table import Table
 from rich.text import Text
 
 from ..schemas.problems import InvalidInput, Problem
+from . import archive_commands, options
 from .calibrate_commands import app as calibrate_app
 from .job import log
+from .options import (
+    ClusterOption,
+    JsonOption,
+    LogJsonOption,
+    ParamsOption,
+    SchedulerOption,
+    SetOption,
+    VerboseOption,
+    WorkersOption,
+)
 from .progress import is_json, log_to_stderr
 
 FAILED, INVALID, INTERRUPTED, TERMINATED = 1, 2, 130, 143
@@ -28,51 +42,71 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 app.add_typer(calibrate_app, name="calibrate")
+for command in (archive_commands.status, archive_commands.reprocess, archive_commands.compare, archive_commands.prune):
+    app.command()(command)
 _console = Console()
 _errors = Console(stderr=True)
 
 MissionArgument = Annotated[
     str, typer.Argument(metavar="MISSION", help="Mission folder, or any URL that fsspec reads.")
 ]
-ParamsOption = Annotated[Path | None, typer.Option("--params", metavar="FILE", help="YAML file of parameters.")]
-VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Log every step that is computed.")]
-JsonOption = Annotated[
-    bool,
-    typer.Option("--log-json", envvar="SEAMOSAIC_LOG_JSON", help="Log to standard error as JSON, one object a line."),
-]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="One parameter, e.g. grid.cell_m=0.05; repeatable."),
-]
 
 
 @app.command()
 def run(
-    mission: MissionArgument,
-    out: Annotated[
-        str,
-        typer.Option("--out", "-o", metavar="OUT", help="Folder or s3://...; products go to OUT/<mission id>/v1, ..."),
+    mission: Annotated[
+        str, typer.Argument(metavar="MISSION|ARCHIVE", help="A mission, or a folder with archive.yaml: path or URL.")
     ],
+    out: Annotated[
+        str | None,
+        typer.Option("--out", "-o", metavar="OUT", help="Folder or s3://...; products go to OUT/<mission id>/v1, ..."),
+    ] = None,
     params: ParamsOption = None,
     set_: SetOption = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one a core.")] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler (tcp://...), or threads or sync.")
-    ] = None,
-    cluster: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="YAML file of a cluster to start: local, slurm or pbs.")
-    ] = None,
-    log_json: JsonOption = False,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    cluster: ClusterOption = None,
+    as_json: JsonOption = False,
+    log_json: LogJsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Process a mission: every product of one mission folder. What was computed before is not computed again."""
+    """Process a mission, or what is new or stale in an archive. What was computed before is not computed again."""
+    from ..catalog.archives import is_archive
     from . import run as runner
 
+    chosen = options.cluster(cluster, scheduler)
+    if is_archive(mission):
+        _refuse_beside_an_archive(out, params, set_)
+        archive_commands.run(mission, archive_commands.Running(scheduler, workers, chosen, as_json, log_json, verbose))
+        return
+    if out is None:
+        remedy = "Add -o OUT; an archive, which has archive.yaml, names it there."
+        raise InvalidInput([Problem("--out", None, "", "nothing", "the folder of the products", remedy)])
     log_to_stderr(verbose, log_json)
-    result = runner.run(mission, out, _parameters(params, set_), scheduler, workers, _cluster(cluster, scheduler))
+    result = runner.run(mission, out, options.parameters(params, set_), scheduler, workers, chosen)
     log.info("mission=%s step=%s path=%s new=%s", result.quality.mission.id, "done", str(result.path), result.new)
-    if not log_json:
+    if as_json:
+        _console.print_json(json.dumps(_summary(result)))
+    elif not log_json:
         _print_result(result)
+
+
+def _refuse_beside_an_archive(out: str | None, params: Path | None, set_: list[str] | None) -> None:
+    for option, given in (("--out", out), ("--params", params), ("--set", set_)):
+        if given:
+            remedy = "Put it into archive.yaml; `seamosaic reprocess` gives some missions other parameters."
+            raise InvalidInput([Problem(option, None, "", str(given), "nothing, for an archive", remedy)])
+
+
+def _summary(result: Any) -> dict[str, Any]:
+    """A run for programs."""
+    return {
+        "mission": result.quality.mission.id,
+        "path": str(result.path),
+        "new": result.new,
+        "steps": [step.model_dump(mode="json") for step in result.steps],
+        "quality": result.quality.model_dump(mode="json"),
+    }
 
 
 @app.command()
@@ -80,7 +114,7 @@ def check(mission: MissionArgument, params: ParamsOption = None, set_: SetOption
     """Say everything that is wrong with a mission, and what `run` would make of it."""
     from . import check as checker
 
-    result = checker.check(mission, _parameters(params, set_))
+    result = checker.check(mission, options.parameters(params, set_))
     checker.print_check(result, _console)
     if not result.valid:
         raise typer.Exit(INVALID)
@@ -131,7 +165,7 @@ def demo(out: Annotated[Path, typer.Argument(metavar="OUT", help="A new or an ea
     if not mission.exists():
         _console.print("Making a small mission over a simulated reef ...")
         simulator.simulate("demo", mission)
-    result = runner.run(str(mission), str(out / "products"), _parameters(None, None))
+    result = runner.run(str(mission), str(out / "products"), options.parameters(None, None))
     _print_result(result)
     measured = evaluator.evaluate(str(result.path), mission)
     _console.print("Against the simulation's truth:")
@@ -145,32 +179,6 @@ def _overrides(images: int | None, width: int | None) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
 
 
-def _parameters(params: Path | None, overrides: list[str] | None):
-    from ..schemas.yaml_input import load_parameters
-
-    text = None if params is None else _text(params, "--params", "a YAML file of parameters")
-    return load_parameters(text, str(params), overrides or [])
-
-
-def _cluster(file: Path | None, scheduler: str | None):
-    from ..schemas.cluster import Cluster
-    from ..schemas.yaml_input import load_model
-
-    if file is None:
-        return None
-    if scheduler is not None:
-        remedy = "Leave one of the two away."
-        raise InvalidInput([Problem("--cluster", None, "", "--cluster and --scheduler", "one of them", remedy)])
-    return load_model(_text(file, "--cluster", "a YAML file of a cluster"), str(file), Cluster)
-
-
-def _text(file: Path, option: str, expected: str) -> str:
-    try:
-        return file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput([Problem(option, None, "", str(error), expected, "Correct the path.")]) from error
-
-
 def _print_result(result: Any) -> None:
     quality = result.quality
     table = Table(
@@ -181,7 +189,7 @@ def _print_result(result: Any) -> None:
         table.add_column(name, justify="right")
     for step in result.steps:
         table.add_row(step.name, str(step.count_computed), str(step.count_reused), f"{step.core_seconds:.1f}")
-    _console.print(table)
+    _console.print(table if result.steps else table.title)
     figures = Table(show_header=False, box=None)
     for name, value in _figures(quality):
         figures.add_row(name, value)

@@ -114,6 +114,7 @@ def once(
     key = digest(step, code, inputs, parameters)
     known = job.store.info(step, key)
     if known is not None:
+        job.store.touch(step, key)
         return Done(step, key, False, float(known["seconds"]), known)
     started = time.process_time()
     made = make()

@@ -322,12 +322,12 @@ def _mesh(
         pictures = [(tile, done) for tile, done in mosaic.tiles if grids.intersection(texture, tile)]
         shown = _touching(outlines, images, own, margin)
         given = (m, place, shown, near, pictures, light, cell)
-        tasks[place] = delayed(meshing.leaf)(*given, dask_key_name=f"mesh-{'-'.join(map(str, place))}")
+        tasks[place] = delayed(meshing.leaf)(*given, dask_key_name=state.key(f"mesh-{'-'.join(map(str, place))}"))
     below = finest
     for level in coarser:
         for place in level:
             children = [(child, tasks[child]) for child in below if child.parent == place]
-            name = f"mesh-{'-'.join(map(str, place))}"
+            name = state.key(f"mesh-{'-'.join(map(str, place))}")
             tasks[place] = delayed(meshing.parent)(m, place, children, dask_key_name=name)
         below = level
     made: list[Done] = compute(state, meshing.MESH, list(tasks.values()))

@@ -11,7 +11,7 @@ import numpy as np
 import pyproj
 from pyproj.crs import CompoundCRS
 
-from ..catalog import meshes, metadata, netcdf, pointclouds, rasters, tiles3d, trajectories, vectors, versions
+from ..catalog import memory, meshes, metadata, netcdf, pointclouds, rasters, tiles3d, trajectories, vectors, versions
 from ..catalog.filesystems import Folder
 from ..catalog.mission_files import MissionFiles
 from ..catalog.missions import OpenedMission
@@ -37,25 +37,11 @@ from .job import code_version, load
 from .results import Results, span, vertical_reference
 from .solve import Solution
 
-_VERSION = code_version(
-    sys.modules[__name__],
-    report_figures,
-    meshes,
-    metadata,
-    netcdf,
-    pointclouds,
-    rasters,
-    trajectories,
-    vectors,
-    contours,
-    mesh_products,
-    tiles3d,
-    report,
-    quality,
-    calibration_quality,
-    residual_quality,
+DECIDING = (
+    *(sys.modules[__name__], report_figures, meshes, metadata, netcdf, pointclouds, rasters, trajectories, vectors),
+    *(contours, mesh_products, tiles3d, report, quality, calibration_quality, residual_quality),
 )
-_NAMED_BY = ("image", "role", "time", "status", "sha256")
+VERSION = code_version(*DECIDING)
 
 
 def write(results: Results) -> tuple[Folder, bool, Quality]:
@@ -64,10 +50,8 @@ def write(results: Results) -> tuple[Folder, bool, Quality]:
     tiles = *mapped.surface.tiles, *mapped.terrain.layers.tiles, *mapped.mosaic.tiles
     keys = [done.key for done in (*(done for _, done in tiles), *mapped.terrain.contours, *mapped.mesh.values())]
     keys += [done.key for done in results.posed.extracted.values()] + [results.posed.adjusted.key]
-    inputs = sorted(f"{name}:{sha}" for name, sha in results.opened.input_digests.items())
-    frames = results.opened.frames
-    inputs += [str(row) for row in zip(*(frames[name].values for name in _NAMED_BY), strict=True)]
-    made_from = digest("products", _VERSION, [*inputs, *keys], job.parameters.model_dump(mode="json"))
+    inputs = memory.inputs_digest(results.opened)
+    made_from = digest("products", VERSION, [inputs, *keys], job.parameters.model_dump(mode="json"))
     writer = versions.new_version(results.out, job.mission_id, made_from)
     if not isinstance(writer, versions.VersionWriter):
         return writer, False, Quality.model_validate_json((writer / "quality.json").read_text(encoding="utf-8"))
@@ -284,6 +268,7 @@ def _provenance(results: Results, made_from: str) -> Provenance:
         inputs=dict(_inputs(results.opened)),
         parameters=resolved,
         steps=results.steps,
+        request=results.request,
     )
 
 

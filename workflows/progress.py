@@ -40,12 +40,16 @@ class JsonLines(logging.Formatter):
         return json.dumps(line, default=str, ensure_ascii=False)
 
 
-def log_to_stderr(verbose: bool, as_json: bool = False) -> None:
-    """Send the log to standard error: JSON, or coloured on a terminal and plain lines elsewhere; details if verbose."""
+def log_to_stderr(verbose: bool, as_json: bool = False, bars: bool = True) -> None:
+    """Send the log to standard error; details if verbose.
+
+    JSON, or coloured on a terminal, with bars of progress, and plain lines elsewhere. bars : False where several
+    processes write to one terminal.
+    """
     handler: logging.Handler = logging.StreamHandler()
     if as_json:
         handler.setFormatter(JsonLines())
-    elif sys.stderr.isatty():
+    elif bars and sys.stderr.isatty():
         handler = RichHandler(console=Console(stderr=True), show_path=False)
     else:
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
@@ -61,7 +65,7 @@ def is_json() -> bool:
 @contextmanager
 def progress(mission: str, step: str, total: int) -> Iterator[Callable[[int], None]]:
     """A function to call with the number of tasks that ended."""
-    if sys.stderr.isatty() and not is_json():
+    if any(isinstance(handler, RichHandler) for handler in log.handlers):
         columns = TextColumn("{task.description:10}"), BarColumn(), MofNCompleteColumn()
         with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=Console(stderr=True)) as bars:
             bar = bars.add_task(step, total=total)

@@ -113,6 +113,21 @@ def quantity_map(
     return figure
 
 
+def difference_map(overview: Overview, geographic: bool, label: str, scale: float = 1.0) -> Figure | None:
+    """A difference in colour: red is more, blue is less, white is none."""
+    if not overview.valid.any():
+        return None
+    values = np.asarray(overview.values[0], float) * scale
+    most = float(np.percentile(np.abs(values[overview.valid]), 98)) or 1.0
+    figure, axes = _map_axes(overview, geographic, 8.4, bar=True)
+    axes.set_facecolor("#d9d9d9")
+    image = axes.imshow(
+        values, cmap="RdBu_r", norm=Normalize(-most, most), extent=overview.extent, interpolation="nearest"
+    )
+    figure.colorbar(image, ax=axes, label=label, extend="both")
+    return figure
+
+
 def source_map(overview: Overview, geographic: bool) -> Figure | None:
     """Where each cell comes from."""
     if not overview.valid.any():

@@ -7,7 +7,7 @@ import numpy as np
 import pyproj
 
 from ..catalog.missions import OpenedMission
-from ..schemas.provenance import Step
+from ..schemas.provenance import Request, Step
 from ..tasks.grids import Grid
 from .job import Done, Job
 from .maps_inputs import MapJob
@@ -54,7 +54,7 @@ class Mapped(NamedTuple):
 
 
 class Results(NamedTuple):
-    """All that products are made from."""
+    """All that products are made from. request : what was asked for, unless the next run has to look again."""
 
     job: Job
     opened: OpenedMission
@@ -63,6 +63,7 @@ class Results(NamedTuple):
     steps: tuple[Step, ...]
     posed: Posed
     mapped: Mapped
+    request: Request | None
 
 
 def span(opened: OpenedMission) -> tuple[datetime, datetime]:

@@ -1,8 +1,11 @@
 """The main job: a mission folder to maps. Images, then pairs, then poses, then map tiles, then the products."""
 
 import itertools
+import sys
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 from uuid import uuid4
@@ -10,21 +13,37 @@ from uuid import uuid4
 import numpy as np
 from dask.delayed import Delayed, delayed
 
-from ..catalog.digests import recall, remember
+from ..catalog import leases, memory, records
 from ..catalog.filesystems import Folder, ObjectStoreError, is_remote, place
 from ..catalog.mission_files import no_access
 from ..catalog.mission_inputs import MISSION
-from ..catalog.missions import OpenedMission, open_mission
+from ..catalog.missions import OpenedMission
+from ..catalog.records import LastRun
 from ..catalog.store import Store
 from ..schemas.cluster import Cluster
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.products import Quality
-from ..schemas.provenance import Step
-from . import dense, extract, layers, mapping, maps, match, meshing, mosaics, plan, products, solve
-from .executor import open_executor
+from ..schemas.provenance import Request, Step
+from . import (
+    dense,
+    extract,
+    layers,
+    mapping,
+    maps,
+    maps_inputs,
+    match,
+    meshing,
+    mosaics,
+    plan,
+    products,
+    request,
+    results,
+    solve,
+)
+from .executor import Executor, open_executor
 from .footing import Footing, software
-from .job import Done, Job, LostEntry, load, log
+from .job import Done, Job, LostEntry, code_version, load, log
 from .plan import Plan
 from .results import Posed, Results
 from .session import Ledger, Session, compute
@@ -40,13 +59,15 @@ class RunResult(NamedTuple):
     Attributes
     ----------
     path : the version's folder. new : False when an earlier version stands for the same inputs and parameters.
-    quality : every figure. steps : what was computed and what was reused.
+    quality : every figure. steps : what was computed and what was reused; none where nothing had to be looked at.
+    request : digest of what was asked for; None where an image could not be read, so that the next run looks again.
     """
 
     path: Folder
     new: bool
     quality: Quality
     steps: tuple[Step, ...]
+    request: str | None = None
 
 
 def run(
@@ -56,16 +77,19 @@ def run(
     scheduler: str | None = None,
     workers: int | None = None,
     cluster: Cluster | None = None,
+    *,
+    leased: bool = False,
 ) -> RunResult:
     """Process a mission into OUT/<mission id>/vN.
 
-    Results of steps are kept in OUT/<mission id>/steps under their digests, so a second run, or one that was
-    stopped, computes only what is not there.
+    If the newest version is what would be made, nothing is done. Results of steps are kept in OUT/<mission id>/steps
+    under their digests, so a run that was stopped goes on, and other parameters compute only what depends on them.
 
     Parameters
     ----------
     mission_url, out : folders, or URLs that fsspec reads and writes.
     scheduler, workers, cluster : where it runs; see `executor.open_executor`.
+    leased : the caller holds the mission's lease; else one is taken, beside others that run, so that nobody prunes.
 
     Raises
     ------
@@ -78,29 +102,54 @@ def run(
     if not is_remote(out) and Path(out).exists() and not Path(out).is_dir():
         remedy = "Give -o a folder, which need not exist."
         raise InvalidInput([Problem(out, None, "", "a file", "a folder", remedy)])
-    opened = _open(mission_url, out)
-    store = Store(f"{out}/{opened.mission.id}/steps")
-    log.info("mission=%s step=%s images=%d", opened.mission.id, "open", opened.frames.sizes["image"])
-    with _footing(store, opened, out) as footing, open_executor(scheduler, workers, cluster) as executor:
-        job = Job(mission_url, opened.mission.id, store, opened.calibration, parameters, footing)
+    started = time.monotonic()
+    with _reaching(out):
+        known = memory.recall(mission_url, out)
+    opened = memory.open_known(mission_url, out, known)
+    mission_id = opened.mission.id
+    log.info("mission=%s step=%s images=%d", mission_id, "open", opened.frames.sizes["image"])
+    asked = request.ask(memory.inputs_digest(opened), parameters, CODE)
+    with _reaching(out):
+        newest = request.standing(out, mission_id, asked)
+    if newest is not None:
+        quality = Quality.model_validate_json((newest.path / "quality.json").read_text(encoding="utf-8"))
+        return RunResult(newest.path, False, quality, ())
+    store = Store(f"{out}/{mission_id}/steps")
+    with (
+        nullcontext() if leased else leases.take(out, mission_id, shared=True),
+        _footing(store, opened, out) as footing,
+        open_executor(scheduler, workers, cluster) as executor,
+    ):
+        job = Job(mission_url, mission_id, store, opened.calibration, parameters, footing)
         executor.check(job)
-        made, lost = plan.plan(opened, parameters), set()
-        while True:
-            try:
-                return _process(Session(job, opened, made, executor, Ledger(), uuid4().hex[:8]), out)
-            except LostEntry as error:
-                if str(error) in lost:  # made anew and damaged again: the disk is to blame
-                    raise
-                lost.add(str(error))
-                log.warning("mission=%s step=%s %s", job.mission_id, "repair", error)
+        result = _until_whole(job, opened, executor, asked, out)
+    ended, seconds = datetime.now(UTC).isoformat(timespec="seconds"), round(time.monotonic() - started, 1)
+    last = LastRun("done", result.request, int(result.path.name[1:]), ended, seconds)
+    records.write_last_run(out, mission_id, last)
+    return result
 
 
-def _process(state: Session, out: str) -> RunResult:
+def _until_whole(job: Job, opened: OpenedMission, executor: Executor, asked: Request, out: str) -> RunResult:
+    """Go over the steps, again where a stored result turns out to be damaged, which makes it anew."""
+    made, lost = plan.plan(opened, job.parameters), set()
+    while True:
+        try:
+            return _process(Session(job, opened, made, executor, Ledger(), uuid4().hex[:8]), asked, out)
+        except LostEntry as error:
+            if str(error) in lost:  # made anew and damaged again: the disk is to blame
+                raise
+            lost.add(str(error))
+            log.warning("mission=%s step=%s %s", job.mission_id, "repair", error)
+
+
+def _process(state: Session, asked: Request, out: str) -> RunResult:
     posed = poses(state)
     mapped = mapping.map_tiles(state, posed)
     steps = state.ledger.steps(_VERSIONS)
-    path, new, quality = products.write(Results(state.job, state.opened, state.plan, out, steps, posed, mapped))
-    return RunResult(path, new, quality, steps)
+    remembered = asked if all(done.key for done in posed.extracted.values()) else None
+    made = Results(state.job, state.opened, state.plan, out, steps, posed, mapped, remembered)
+    path, new, quality = products.write(made)
+    return RunResult(path, new, quality, steps, remembered.digest if remembered else None)
 
 
 def _absolute(url: str | Path) -> str:
@@ -138,18 +187,14 @@ _VERSIONS = {
     **mosaics.VERSIONS,
     **meshing.VERSIONS,
 }
-
-
-def _open(mission_url: str, out: str) -> OpenedMission:
-    """Open a mission, remembering the images' digests between runs."""
-    with _reaching(out):
-        known = recall(out, mission_url)
-    before = len(known)
-    opened = open_mission(mission_url, known)
-    if len(known) != before:
-        with _reaching(out):
-            remember(out, mission_url, known)
-    return opened
+DECIDING = (sys.modules[__name__], plan, mapping, maps_inputs, results)
+# all that decides what a request comes to
+CODE = {
+    **_VERSIONS,
+    "products": products.VERSION,
+    "opening": request.OPENING,
+    "workflow": code_version(*DECIDING),
+}
 
 
 def poses(state: Session) -> Posed:

@@ -68,13 +68,13 @@ def test_a_json_log_is_one_object_a_line(reef, tiny_mission, monkeypatch, capfd)
     assert captured.out == ""
     lines = [json.loads(line) for line in captured.err.splitlines()]
     assert all({"time", "level", "mission", "step"} <= set(line) for line in lines)
-    (extract,) = (line for line in lines if line["step"] == "poses")
-    assert extract["done"] == extract["total"] > 1
     assert (lines[-1]["step"], lines[-1]["new"], lines[-1]["path"]) == ("done", False, str(reef.result.path))
     sorted((tiny_mission / "images").iterdir())[2].write_bytes(b"no image")
     assert _main(monkeypatch, "run", tiny_mission, "-o", tiny_mission.parent / "out", *options) == 1
     lines = [json.loads(line) for line in capfd.readouterr().err.splitlines()]
     assert "nothing to map" in lines[-1]["message"]
+    (extract,) = (line for line in lines if line["step"] == "poses")
+    assert extract["done"] == extract["total"] > 1
     assert _main(monkeypatch, "run", tiny_mission / "nowhere", "-o", tiny_mission.parent / "out", *options) == 2
     (line,) = (json.loads(line) for line in capfd.readouterr().err.splitlines())
     assert (line["level"], line["step"]) == ("error", "invalid")

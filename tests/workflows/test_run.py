@@ -20,14 +20,13 @@ import trimesh
 import xarray
 import yaml
 from rio_cogeo import cog_validate
-from seamosaic.catalog import trajectories
+from seamosaic.catalog import memory, trajectories
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.products import PRODUCTS
 from seamosaic.tasks import derivatives
 from seamosaic.tasks.grids import Grid
 from seamosaic.workflows import mesh_products, meshing
-from seamosaic.workflows import run as runner
 from seamosaic.workflows.evaluate import evaluate
 from seamosaic.workflows.job import Done
 from seamosaic.workflows.mapping import NothingToMap
@@ -369,14 +368,14 @@ def test_a_bad_image_is_recorded_and_the_run_goes_on(spoilt, tmp_path):
 
 def test_an_image_changed_during_the_run_is_rejected(spoilt, tmp_path, monkeypatch):
     mission, image = spoilt
-    opened = runner._open
+    opened = memory.open_known
 
     def replaced(*arguments):
         found = opened(*arguments)
         shutil.copy(sorted((mission / "images").iterdir())[4], image)
         return found
 
-    monkeypatch.setattr(runner, "_open", replaced)
+    monkeypatch.setattr(memory, "open_known", replaced)
     result = run(str(mission), tmp_path / "out", Parameters(), scheduler="sync")
     rows = trajectories.read(result.path / "trajectory.csv")
     (status,) = (row.status for row in rows if row.kind == "rejected")
