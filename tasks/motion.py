@@ -23,7 +23,8 @@ _SCALE_RADIUS = 0.03  # slope within which a sounding tells a feature's depth: 9
 _MIN_SCALE_FEATURES = 5
 _LASER_CONTRADICTS = 0.1  # spread of the depth ratios beyond which a motion is not the right one
 _UNIT_LENGTH_SIGMA = 1e-3
-_MAX_MATCHES = 500
+_MAX_MATCHES = 300
+_PLANE_POINTS = 500
 
 
 class Plane(NamedTuple):
@@ -61,6 +62,7 @@ def fit_plane(X: Array, tolerance_m: float, trials: int = 200) -> Plane | None:
     """Plane through points (N, 3) by RANSAC, refined on its inliers; the normal points away from the camera."""
     if len(X) < 10:
         return None
+    X = X[:: max(1, len(X) // _PLANE_POINTS)]
     rng = np.random.default_rng(0)
     corners = X[rng.integers(0, len(X), (trials, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,5 +1,6 @@
 """Per image: decoded once; laser soundings, features and colour statistics into the store."""
 
+import math
 import sys
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,12 +19,21 @@ VERSION = code_version(sys.modules[__name__])
 
 
 class ImageTask(NamedTuple):
-    """An image to extract: its row in the frames table, path, digest and role."""
+    """An image to extract: its row in the frames table, path, digest and role.
+
+    north_deg : direction of north in it, from u towards v, where the headings of all images are known.
+    """
 
     row: int
     path: str
     sha256: str
     role: Role
+    north_deg: int | None = None
+
+    @property
+    def north_rad(self) -> float | None:
+        """`north_deg` in radians."""
+        return None if self.north_deg is None else math.radians(self.north_deg)
 
 
 def extract_batch(job: Job, batch: Sequence[ImageTask]) -> list[Done]:
@@ -37,6 +47,7 @@ def _extract(job: Job, image: ImageTask) -> Done:
     light = calibration.laser if image.role != "texture" else None
     parameters = [
         image.role,
+        image.north_deg,
         *stage(calibration.camera, job.parameters.laser, job.parameters.features),
         light.model_dump(mode="json") if light else None,
     ]
@@ -46,7 +57,7 @@ def _extract(job: Job, image: ImageTask) -> Done:
             bgr = read_verified(job, image.path, image.sha256)
         except UnreadableImage as error:
             return Made({}, _rejected(error))
-        return _measure(job, image.role, light, bgr)
+        return _measure(job, image, light, bgr)
 
     try:
         return once(job, STEP, VERSION, [image.sha256], parameters, make)
@@ -76,7 +87,7 @@ def read_verified(job: Job, path: str, sha256: str, reduce: int = 1) -> np.ndarr
     return decoded.bgr
 
 
-def _measure(job: Job, role: Role, light: Laser | None, bgr: np.ndarray) -> Made:
+def _measure(job: Job, image: ImageTask, light: Laser | None, bgr: np.ndarray) -> Made:
     arrays, reason = {}, ""
     erase = np.zeros(bgr.shape[:2], bool)
     count, range_m, sigma_m, halfwidth_px, agreement = 0, None, None, 0.0, None
@@ -95,9 +106,9 @@ def _measure(job: Job, role: Role, light: Laser | None, bgr: np.ndarray) -> Made
             "line_uv": found.line_uv,
         }
     feature_count = 0
-    if role != "laser":
+    if image.role != "laser":
         grey = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-        points = features.detect(grey, erase, job.parameters.features)
+        points = features.detect(grey, erase, job.parameters.features, image.north_rad)
         feature_count = len(points.uv)
         arrays |= {
             "feature_uv": points.uv,

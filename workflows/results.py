@@ -11,6 +11,7 @@ from ..schemas.provenance import Request, Step
 from ..tasks.grids import Grid
 from .job import Done, Job
 from .maps_inputs import MapJob
+from .meshing import Place
 from .plan import Plan
 from .solve import Solution
 
@@ -31,6 +32,14 @@ class Tiles(NamedTuple):
     tiles: tuple[tuple[Grid, Done], ...]
 
 
+class TerrainLayers(NamedTuple):
+    """Habitat layers, and the contours of each tile with their interval."""
+
+    layers: Tiles
+    contours: tuple[Done, ...]
+    interval_m: float
+
+
 class Mapped(NamedTuple):
     """Results of the map tiles. outlines : (n, M, 2) footprints in map coordinates."""
 
@@ -38,7 +47,9 @@ class Mapped(NamedTuple):
     cell_m: float
     mosaic_cell_m: float
     surface: Tiles
+    terrain: TerrainLayers
     mosaic: Tiles
+    mesh: dict[Place, Done]
     outlines: np.ndarray
 
 

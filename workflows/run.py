@@ -25,7 +25,22 @@ from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.products import Quality
 from ..schemas.provenance import Request, Step
-from . import dense, extract, mapping, maps, maps_inputs, match, mosaics, plan, products, request, results, solve
+from . import (
+    dense,
+    extract,
+    layers,
+    mapping,
+    maps,
+    maps_inputs,
+    match,
+    meshing,
+    mosaics,
+    plan,
+    products,
+    request,
+    results,
+    solve,
+)
 from .executor import Executor, open_executor
 from .footing import Footing, software
 from .job import Done, Job, LostEntry, code_version, load, log
@@ -168,7 +183,9 @@ _VERSIONS = {
     solve.STEP: solve.VERSION,
     **dense.VERSIONS,
     **maps.VERSIONS,
+    **layers.VERSIONS,
     **mosaics.VERSIONS,
+    **meshing.VERSIONS,
 }
 DECIDING = (sys.modules[__name__], plan, mapping, maps_inputs, results)
 # all that decides what a request comes to
