@@ -25,7 +25,8 @@ def test_every_module_behind_the_products_is_in_the_code_of_a_request(monkeypatc
     """A module that is forgotten would leave versions current that its change made stale."""
     seen = {}
     monkeypatch.setattr(job.inspect, "getsource", lambda module: seen.setdefault(module.__name__, "") and "")
-    modules = [vars(run)[name] for name in ("dense", "extract", "maps", "match", "mosaics", "solve", "products")]
+    steps = ("dense", "extract", "layers", "maps", "match", "meshing", "mosaics", "solve", "products")
+    modules = [vars(run)[name] for name in steps]
     for module in [*modules, *run.DECIDING, *products.DECIDING, *request.DECIDING]:
         job.code_version(module)
     loaded = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, check=True).stdout.split()
