@@ -24,7 +24,7 @@ Indices = NDArray[np.intp]
 _ROUNDS: Final = 4
 _ROUNDS_BENT: Final = 7
 _RELEASES: Final = 2
-_BEND: Final = 0.03  # how far a board may bend, as a share of its size
+_BEND: Final = 0.01  # how far a board may bend, as a share of its size
 _PRINTED: Final = 0.01  # how far a corner may be from its place, as a share of the distance to the next
 _NUDGE_M: Final = 1e-6
 _MOST_ALIKE: Final = 0.9
@@ -131,7 +131,8 @@ def calibrate_board(data: BoardData, camera: Camera, free: Sequence[str], bent: 
     """
     names = (*_PINHOLE, *DISTORTION[camera.model])
     poses = first_poses(camera, _by_image(data))
-    problem = _Problem(data, data.corner_board, camera, names, tuple(free), (), np.zeros(0), _CORNER_SIGMA_PX, 1.0, FLAT)
+    printed, unknown = data.corner_board, np.zeros(0)
+    problem = _Problem(data, printed, camera, names, tuple(free), (), unknown, _CORNER_SIGMA_PX, 1.0, FLAT)
     light = _on_board(_State(camera, np.zeros((0, 4)), FLAT, poses), data)
     count = int(data.laser_sheet.max(initial=-1)) + 1
     starts = tuple(first_sheet(str(s), light[data.laser_sheet == s]) for s in range(count))
