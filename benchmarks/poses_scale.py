@@ -5,6 +5,7 @@ pair motions and drifting navigation, goes through the pose graph and the bundle
 made here, not detected: this is about the adjustment alone.
 """
 
+import itertools
 import resource
 import sys
 import time
@@ -14,7 +15,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from seamosaic.schemas.calibration import Camera
 from seamosaic.schemas.parameters import AdjustParameters
-from seamosaic.tasks import adjust, bundle
+from seamosaic.tasks import adjust, bundle, crossovers
 from seamosaic.tasks.adjust import Link
 from seamosaic.tasks.camera import project
 from seamosaic.tasks.motion import Motion
@@ -103,15 +104,17 @@ def spread(off) -> float:
     return float(np.sqrt(((off - off.mean(0)) ** 2).sum(1).mean()))
 
 
-def run(count: int) -> None:
+def run(count: int) -> float:
+    """Adjust a survey of `count` images; processor seconds."""
     rng, p = np.random.default_rng(count), AdjustParameters()
     true = survey(count, rng)
     seen, prior, linked = sights(true, rng), navigation(true, rng), links(true, rng)
     lit = {k: soundings(true, k, rng) for k in range(count)}
+    lines = crossovers.lines({k: (X, np.repeat([0, 1], len(X) // 2)) for k, X in lit.items()})
     began = time.process_time()
     chained = adjust.adjust(count, linked, prior, true.R_local_camera[0], p)
     middle = time.process_time()
-    found = bundle.adjust(LENS, chained, seen, lit, prior, p)
+    found = bundle.adjust(LENS, chained, seen, lit, lines, prior, p)
     ended = time.process_time()
     rms = [spread(each.poses.C_local - true.C_local) for each in (chained, found)]
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
@@ -121,8 +124,11 @@ def run(count: int) -> None:
         f"rms {rms[0] * 1e3:.1f} mm, then {rms[1] * 1e3:.1f} mm",
         flush=True,
     )
+    return ended - began
 
 
 if __name__ == "__main__":
-    for size in [int(a) for a in sys.argv[1:]] or [1000, 10_000]:
-        run(size)
+    sizes = sorted(int(a) for a in sys.argv[1:]) or [1000, 10_000]  # the peak of memory is that of all so far
+    seconds = [run(size) for size in sizes]
+    for (n, before), (m, after) in itertools.pairwise(zip(sizes, seconds, strict=True)):
+        print(f"from {n} to {m} images time grows as n^{np.log(after / before) / np.log(m / n):.2f}")

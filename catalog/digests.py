@@ -8,6 +8,7 @@ from typing import Any, BinaryIO, NamedTuple, cast
 
 from fsspec import AbstractFileSystem
 
+from .filesystems import ObjectStoreError, asking
 from .image_headers import HEADER_BYTES, TAIL_BYTES, Header, read_header
 
 _BLOCK = 4 * 1024 * 1024
@@ -46,7 +47,7 @@ def inspect_images(
         of plain values, so that it can be kept as JSON. None to read everything.
     """
     known = {} if known is None else known
-    keys = [_key(path, info) for path, info in files]
+    keys = [file_key(path, info) for path, info in files]
     unread = [i for i, key in enumerate(keys) if key is None or key not in known]
     read = dict(zip(unread, _all(_inspect, fs, [files[i][0] for i in unread]), strict=True))
     for i, inspection in read.items():
@@ -54,6 +55,11 @@ def inspect_images(
         if key is not None and inspection.sha256:
             known[key] = [inspection.sha256, list(inspection.header)]
     return [read[i] if i in read else _recall(known[str(key)]) for i, key in enumerate(keys)]
+
+
+def are_known(files: Sequence[tuple[str, Mapping[str, Any]]], known: Mapping[str, Any] | None) -> bool:
+    """Whether `inspect_images` would have to read none of these files."""
+    return all(file_key(path, info) in (known or {}) for path, info in files)
 
 
 def peek_images(fs: AbstractFileSystem, files: Sequence[tuple[str, Mapping[str, Any]]]) -> list[Inspection]:
@@ -72,8 +78,8 @@ def _recall(value: Sequence[Any]) -> Inspection:
     return Inspection(value[0], Header(*value[1]))
 
 
-def _key(path: str, info: Mapping[str, Any]) -> str | None:
-    """Path, size and time of change; None if the file system does not tell the latter."""
+def file_key(path: str, info: Mapping[str, Any]) -> str | None:
+    """Path, size and time of change of a file; None if the file system does not tell the latter."""
     modified = next((info[name] for name in _MODIFIED if info.get(name) is not None), None)
     return None if modified is None else f"{path}|{info.get('size')}|{modified}"
 
@@ -81,22 +87,26 @@ def _key(path: str, info: Mapping[str, Any]) -> str | None:
 def _inspect(fs: AbstractFileSystem, path: str) -> Inspection:
     digest, head, tail = hashlib.sha256(), b"", b""
     try:
-        with cast(BinaryIO, fs.open(path, "rb")) as file:
+        with asking(fs, path), cast(BinaryIO, fs.open(path, "rb")) as file:
             while block := file.read(_BLOCK):
                 digest.update(block)
                 head = head or block[:HEADER_BYTES]
                 tail = (tail + block)[-TAIL_BYTES:]
             return Inspection(digest.hexdigest(), read_header(head, tail, file))
+    except ObjectStoreError:
+        raise
     except OSError as error:
         return _unreadable(error)
 
 
 def _peek(fs: AbstractFileSystem, path: str) -> Inspection:
     try:
-        with cast(BinaryIO, fs.open(path, "rb")) as file:
+        with asking(fs, path), cast(BinaryIO, fs.open(path, "rb")) as file:
             head = file.read(HEADER_BYTES)
             file.seek(max(0, file.seek(0, io.SEEK_END) - TAIL_BYTES))
             return Inspection("", read_header(head, file.read(TAIL_BYTES), file))
+    except ObjectStoreError:
+        raise
     except OSError as error:
         return _unreadable(error)
 

@@ -5,11 +5,11 @@ from typing import Final, NamedTuple, cast
 
 import cv2
 import numpy as np
-from fsspec.core import url_to_fs
 from numpy.typing import NDArray
 
 from ..schemas.calibration import Camera
 from .digests import sha256
+from .filesystems import ObjectStoreError, asking, connect
 from .image_headers import HEADER_BYTES, TAIL_BYTES, read_header
 
 
@@ -24,6 +24,10 @@ class UnreadableImage(Exception):
     def __init__(self, reason: str):
         super().__init__(reason)
         self.reason = reason
+
+
+class MissingImage(OSError):
+    """An image that is gone, may not be read, or is another one than it was."""
 
 
 class DecodedImage(NamedTuple):
@@ -62,14 +66,19 @@ def read_image(mission: str, image: str, camera: Camera, reduce: int = 1) -> Dec
     ------
     UnreadableImage
         If the file is truncated, damaged or of another size.
-    OSError
-        If it cannot be read now, which may be no fault of the image.
+    MissingImage
+        If it is not to be had now, which may be no fault of the image.
+    ObjectStoreError
+        If the object store does not give it: no fault of the image.
     """
-    fs, root = url_to_fs(mission)
+    fs, root = connect(mission)
     try:
-        content = cast(bytes, fs.cat_file(f"{root.rstrip('/')}/{image}"))
+        with asking(fs, f"{mission}/{image}"):
+            content = cast(bytes, fs.cat_file(f"{root.rstrip('/')}/{image}"))
+    except ObjectStoreError:
+        raise
     except OSError as error:
-        raise OSError(f"{image} cannot be read ({error.strerror or error})") from error
+        raise MissingImage(f"{image} cannot be read ({error.strerror or error})") from error
     return DecodedImage(decode(content, camera, reduce), sha256(content))
 
 

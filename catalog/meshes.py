@@ -4,21 +4,19 @@ Triangles are counter-clockwise seen from above. Texture coordinates are (u, v) 
 the top left corner of the texture, in units of its width and height.
 """
 
-import io
 import json
 import os
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-_JPEG_QUALITY: Final = 90
-_FLOAT, _UINT, _ARRAY, _INDEX = 5126, 5125, 34962, 34963
+_FLOAT, _UINT, _USHORT, _ARRAY, _INDEX = 5126, 5125, 5123, 34962, 34963
+_MOST_SHORT: Final = 65535  # vertices; the number 65535 itself ends a strip
 _GREY: Final = [0.6, 0.6, 0.6, 1.0]
 
 
@@ -63,47 +61,43 @@ def _ply_header(fields: list[tuple[str, str]], points: int, faces: int, comments
     return "\n".join(lines).encode("ascii", "replace")
 
 
-def write_glb(
-    path: str | os.PathLike[str],
-    vertices: NDArray[np.floating],
-    triangles: NDArray[np.integer],
-    uv: NDArray[np.floating] | None = None,
-    texture_rgb: NDArray[np.uint8] | None = None,
-    extras: Mapping[str, Any] | None = None,
-) -> None:
-    """Write a binary glTF 2.0 with a JPEG texture.
+class Part(NamedTuple):
+    """A piece of a surface with a texture of its own.
+
+    Attributes
+    ----------
+    vertices : (N, 3) x east, y north, z up, metres from the local origin.
+    normals : (N, 3) unit vectors along the same axes.
+    triangles : (T, 3) indices of vertices.
+    uv : (N, 2) texture coordinates.
+    texture : a JPEG file, row 0 at v = 0; None for grey.
+    """
+
+    vertices: NDArray[np.floating]
+    normals: NDArray[np.floating]
+    triangles: NDArray[np.integer]
+    uv: NDArray[np.floating]
+    texture: bytes | None = None
+
+
+def write_glb(path: str | os.PathLike[str], parts: Sequence[Part], extras: Mapping[str, Any] | None = None) -> None:
+    """Write a binary glTF 2.0; without any triangle it holds an empty scene.
 
     glTF is y up: a vertex (east, north, up) is stored as (east, up, -north).
 
     Parameters
     ----------
-    vertices : (N, 3) x east, y north, z up, metres from the local origin.
-    triangles : (T, 3) indices of vertices; without any, the file holds an empty scene.
-    uv, texture_rgb : (N, 2) and (h, w, 3) uint8, row 0 at v = 0; both or neither.
     extras : put under asset.extras, such as the CRS and the offset of the origin.
     """
-    if (uv is None) != (texture_rgb is None):
-        raise ValueError("a texture needs texture coordinates, and the reverse")
     builder = _Gltf(extras or {})
-    if len(triangles):
-        z_up = np.asarray(vertices, float)
-        builder.add_mesh(_y_up(z_up), _y_up(_normals(z_up, triangles)), triangles, uv, texture_rgb)
+    for part in parts:
+        if len(part.triangles):
+            builder.add(part)
     _write(Path(path), *builder.chunks())
 
 
-def _y_up(vectors: NDArray[np.float64]) -> NDArray[np.float32]:
+def _y_up(vectors: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.column_stack([vectors[:, 0], vectors[:, 2], -vectors[:, 1]]).astype("<f4")
-
-
-def _normals(vertices: NDArray[np.float64], triangles: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Unit normals (N, 3): the area-weighted mean of the triangles around each vertex; up where there is none."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    faces = np.cross(b - a, c - a)
-    normals = np.column_stack(
-        [np.bincount(triangles.ravel(), np.repeat(faces[:, k], 3), len(vertices)) for k in range(3)]
-    )
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
 
 
 class _Gltf:
@@ -114,57 +108,54 @@ class _Gltf:
         self.document: dict[str, Any] = {"asset": asset, "scene": 0, "scenes": [{"name": "seabed"}]}
         self.buffer = bytearray()
 
-    def add_mesh(
-        self,
-        positions: NDArray[np.float32],
-        normals: NDArray[np.float32],
-        triangles: NDArray[np.integer],
-        uv: NDArray[np.floating] | None,
-        texture_rgb: NDArray[np.uint8] | None,
-    ) -> None:
+    def add(self, part: Part) -> None:
+        positions = _y_up(part.vertices)
         bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
         attributes = {
             "POSITION": self._accessor(positions, "VEC3", _FLOAT, _ARRAY, bounds),
-            "NORMAL": self._accessor(normals, "VEC3", _FLOAT, _ARRAY),
+            "NORMAL": self._accessor(_y_up(part.normals), "VEC3", _FLOAT, _ARRAY),
         }
-        surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-        if uv is not None and texture_rgb is not None:
-            attributes["TEXCOORD_0"] = self._accessor(np.asarray(uv, "<f4"), "VEC2", _FLOAT, _ARRAY)
-            surface["baseColorTexture"] = {"index": self._texture(texture_rgb)}
+        look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+        if part.texture is not None:
+            attributes["TEXCOORD_0"] = self._accessor(np.asarray(part.uv, "<f4"), "VEC2", _FLOAT, _ARRAY)
+            look["baseColorTexture"] = {"index": self._texture(part.texture)}
         else:
-            surface["baseColorFactor"] = _GREY
-        indices = self._accessor(np.asarray(triangles, "<u4").reshape(-1), "SCALAR", _UINT, _INDEX)
-        self.document["materials"] = [{"name": "seabed", "pbrMetallicRoughness": surface, "doubleSided": True}]
-        self.document["meshes"] = [
-            {"name": "seabed", "primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}
-        ]
-        self.document["nodes"] = [{"name": "seabed", "mesh": 0}]
-        self.document["scenes"][0]["nodes"] = [0]
+            look["baseColorFactor"] = _GREY
+        small = len(positions) < _MOST_SHORT
+        indices = np.asarray(part.triangles, "<u2" if small else "<u4").reshape(-1)
+        primitive = {
+            "attributes": attributes,
+            "indices": self._accessor(indices, "SCALAR", _USHORT if small else _UINT, _INDEX),
+            "material": self._listed("materials", {"pbrMetallicRoughness": look, "doubleSided": True}),
+        }
+        mesh = self._listed("meshes", {"primitives": [primitive]})
+        node = self._listed("nodes", {"name": f"seabed-{mesh}", "mesh": mesh})
+        self.document["scenes"][0].setdefault("nodes", []).append(node)
+
+    def _listed(self, kind: str, item: Mapping[str, Any]) -> int:
+        """The number of an item that is added to a list of the document."""
+        items = self.document.setdefault(kind, [])
+        items.append(dict(item))
+        return len(items) - 1
 
     def _accessor(
         self, values: NDArray[Any], kind: str, component: int, target: int, bounds: Mapping[str, Any] | None = None
     ) -> int:
         view = self._view(values.tobytes(), {"target": target})
-        accessors = self.document.setdefault("accessors", [])
-        accessors.append(
-            {"bufferView": view, "componentType": component, "count": len(values), "type": kind, **(bounds or {})}
-        )
-        return len(accessors) - 1
+        about = {"bufferView": view, "componentType": component, "count": len(values), "type": kind}
+        return self._listed("accessors", {**about, **(bounds or {})})
 
-    def _texture(self, texture_rgb: NDArray[np.uint8]) -> int:
-        stream = io.BytesIO()
-        Image.fromarray(texture_rgb).save(stream, "JPEG", quality=_JPEG_QUALITY)
-        self.document["images"] = [{"bufferView": self._view(stream.getvalue(), {}), "mimeType": "image/jpeg"}]
+    def _texture(self, jpeg: bytes) -> int:
         clamp, linear, mipmap = 33071, 9729, 9987
-        self.document["samplers"] = [{"magFilter": linear, "minFilter": mipmap, "wrapS": clamp, "wrapT": clamp}]
-        self.document["textures"] = [{"sampler": 0, "source": 0}]
-        return 0
+        if "samplers" not in self.document:
+            self._listed("samplers", {"magFilter": linear, "minFilter": mipmap, "wrapS": clamp, "wrapT": clamp})
+        image = self._listed("images", {"bufferView": self._view(jpeg, {}), "mimeType": "image/jpeg"})
+        return self._listed("textures", {"sampler": 0, "source": image})
 
     def _view(self, data: bytes, more: Mapping[str, Any]) -> int:
-        views = self.document.setdefault("bufferViews", [])
-        views.append({"buffer": 0, "byteOffset": len(self.buffer), "byteLength": len(data), **more})
+        about = {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": len(data), **more}
         self.buffer += data + bytes(-len(data) % 4)
-        return len(views) - 1
+        return self._listed("bufferViews", about)
 
     def chunks(self) -> list[bytes]:
         """The GLB file: header, JSON chunk and, where there is anything, the binary chunk."""

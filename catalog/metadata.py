@@ -25,7 +25,6 @@ _SOFTWARE: Final = (
     *("seamosaic", "numpy", "scipy", "opencv-python-headless", "gtsam", "rasterio", "pyproj", "dask", "xarray"),
     *("laspy", "lazrs", "h5netcdf", "h5py", "pyogrio", "shapely", "pillow", "matplotlib"),
 )
-_OPEN3D: Final = ("open3d-cpu", "open3d")
 _PROJECTION: Final = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
 _FILE: Final = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
 _EDGE_STEPS: Final = 16
@@ -49,10 +48,10 @@ def output_digests(folder: str | os.PathLike[str]) -> dict[str, str]:
 def software_versions() -> dict[str, str]:
     """Versions of everything that can change a result."""
     found = {"python": platform.python_version(), "gdal": rasterio.__gdal_version__, "proj": pyproj.proj_version_str}
-    for name in (*_SOFTWARE, *_OPEN3D):
+    for name in _SOFTWARE:
         try:
             found[name] = version(name)
-        except PackageNotFoundError:  # an optional one, or open3d's other build
+        except PackageNotFoundError:
             continue
     return found
 

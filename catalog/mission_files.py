@@ -5,12 +5,12 @@ from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, cast
 
 from fsspec import AbstractFileSystem
-from fsspec.core import url_to_fs
 
 from ..schemas.mission import Mission
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.yaml_document import Document
-from .digests import sha256
+from .digests import file_key, sha256
+from .filesystems import ObjectStoreError, asking, connect, is_remote
 
 _MAGIC = "*?["
 
@@ -56,7 +56,8 @@ class MissionFiles:
         asked : a problem whose file, line and key say who asks for the file; its remedy is added.
         """
         try:
-            content = cast(bytes, self.fs.cat_file(f"{self.root}/{name}"))
+            with asking(self.fs, f"{self.url}/{name}"):
+                content = cast(bytes, self.fs.cat_file(f"{self.root}/{name}"))
         except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
             problem = asked or Problem(name, None, "", "", "", "Give the folder that holds it.")
             problems.append(problem._replace(found=f"no file {name} in {self.url}", expected="the file"))
@@ -69,7 +70,11 @@ class MissionFiles:
         return content
 
     def has(self, name: str) -> bool:
-        return self.fs.isfile(f"{self.root}/{name}")
+        try:
+            with asking(self.fs, f"{self.url}/{name}"):
+                return self.fs.info(f"{self.root}/{name}")["type"] == "file"
+        except (FileNotFoundError, NotADirectoryError):
+            return False
 
     def matching(self, pattern: str) -> dict[str, tuple[str, dict[str, Any]]]:
         """Files that match a glob (`*`, `?`, `[…]`, `**` for folders): relative path to path and entry, sorted.
@@ -81,6 +86,10 @@ class MissionFiles:
         found = self._files("/".join(parts[:fixed]), None if "**" in parts else len(parts) - fixed)
         return {name: entry for name, entry in sorted(found.items()) if _matches(name.split("/"), parts)}
 
+    def keys(self) -> dict[str, str | None]:
+        """Path, size and time of change of every file, as of now, by relative path; None where that is not told."""
+        return {name: file_key(path, info) for name, (path, info) in self._files("", None).items()}
+
     def folder_of(self, pattern: str) -> list[str]:
         """Names of the files in the folder in which a pattern looks, for a message."""
         folder = pattern.rpartition("/")[0]
@@ -90,26 +99,41 @@ class MissionFiles:
 
     def _files(self, folder: str, depth: int | None) -> dict[str, tuple[str, dict[str, Any]]]:
         base = f"{self.root}/{folder}".rstrip("/")
-        found: dict[str, dict[str, Any]] = self.fs.find(base, maxdepth=depth, detail=True)  # type: ignore[assignment]
+        with asking(self.fs, self.url):
+            found: dict[str, dict[str, Any]] = self.fs.find(base, maxdepth=depth, detail=True)  # type: ignore[assignment]
         start = len(self.root) + 1
         return {path[start:]: (path, info) for path, info in found.items()}
 
 
 def _connect(url: str) -> tuple[AbstractFileSystem, str]:
     try:
-        fs, root = url_to_fs(url)
-        exists = fs.isdir(root)
+        fs, root = connect(url)
+        with asking(fs, url):
+            exists = fs.isdir(root)
     except (ImportError, ValueError) as error:
-        remedy = "Give a folder, or a URL that fsspec reads; its driver (such as s3fs) has to be installed."
+        remedy = "Give a folder, or a URL that fsspec reads; its driver has to be installed."
         raise InvalidInput([Problem(url, None, "", f"no access ({error})", "a mission folder", remedy)]) from None
     except OSError as error:
-        remedy = "Check the connection and the credentials."
-        raise InvalidInput([Problem(url, None, "", f"no access ({error})", "a mission folder", remedy)]) from None
+        raise InvalidInput([no_access(url, error, "a mission folder")]) from None
     if not exists:
         found = "a file" if fs.exists(root) else "nothing"
         remedy = "Give the folder that holds mission.yaml."
         raise InvalidInput([Problem(url, None, "", found, "a mission folder", remedy)])
     return fs, root
+
+
+def no_access(url: str, error: OSError, expected: str) -> Problem:
+    """Why a folder or an object store cannot be used, and what to look at."""
+    reason = str(error).removeprefix(f"{url}: ")
+    if isinstance(error, ObjectStoreError):
+        remedy = "Check that the object store runs, AWS_ENDPOINT_URL, and the credentials (docs/clusters.md)."
+    elif isinstance(error, FileNotFoundError) and is_remote(url):
+        remedy = "Make the bucket, or correct its name."
+    elif is_remote(url):
+        remedy = "Check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they may do there (docs/clusters.md)."
+    else:
+        remedy = "Check its permissions and the connection."
+    return Problem(url, None, "", f"no access ({reason})", expected, remedy)
 
 
 def _matches(parts: Sequence[str], patterns: Sequence[str]) -> bool:

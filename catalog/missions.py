@@ -11,7 +11,7 @@ from ..schemas.mission import Mission
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.timestamps import iso
 from .coordinate_systems import Place, Systems, resolve
-from .digests import inspect_images, peek_images
+from .digests import are_known, inspect_images, peek_images
 from .frames_table import build_frames
 from .interpolation import smoothed
 from .mission_files import MissionFiles, find_images
@@ -50,7 +50,7 @@ def open_mission(
     url: str,
     digests: MutableMapping[str, Any] | None = None,
     *,
-    hashed: bool = True,
+    hashed: bool | None = True,
     smooth_s: float = 0.0,
     level_floor: bool = False,
     shift_s: float = 0.0,
@@ -62,7 +62,8 @@ def open_mission(
     url : a folder, or any URL that fsspec reads.
     digests : what earlier runs learnt of the images, by path, size and time of change, so that a rerun does not
         read them all again; added to. Its values are plain lists, fit for JSON.
-    hashed : False to look at the images' headers only, for a quick check; `sha256` is empty then.
+    hashed : False to look at the images' headers only, for a quick check; `sha256` is empty then. None to do so
+        unless all of them are known by `digests`.
     smooth_s : half the window over which depth, altitude, roll and pitch are smoothed, seconds; 0 for not at all.
     level_floor : the seabed is flat, so that altitudes are smoothed together with depths.
     shift_s : seconds added to navigation times besides the mission's own time_offset.
@@ -82,7 +83,7 @@ def open_mission(
     problems += more
     listed = [(image.path, image.info) for image in images]
     # What is wrong anyway is said without reading gigabytes first.
-    quick = problems or not hashed
+    quick = problems or not (are_known(listed, digests) if hashed is None else hashed)
     inspections = peek_images(files.fs, listed) if quick else inspect_images(files.fs, listed, digests)
     if inputs.navigation is not None and smooth_s > 0:
         inputs = inputs._replace(navigation=smoothed(inputs.navigation, smooth_s, level_floor))

@@ -87,8 +87,27 @@ LAYERS: Final[Mapping[str, Layer]] = {
     "uncertainty.tif": Layer(("1-sigma of the elevation",), "float32", NODATA_M, "metre"),
     "density.tif": Layer(("soundings in the cell",), "uint32", None),
     "source.tif": Layer((f"source: {_SOURCES}",), "uint8", 0, resampling="nearest", colours=SOURCE_COLOURS),
+    **{
+        f"terrain/{name}.tif": Layer((about,), "float32", NODATA_M, unit, "nearest" if name == "aspect" else "average")
+        for name, about, unit in (
+            ("slope", "slope", "degree"),
+            ("aspect", "direction of falling ground, clockwise from grid north", "degree"),
+            ("profile-curvature", "curvature along the slope, convex positive", "1/metre"),
+            ("plan-curvature", "curvature across the slope, convex positive", "1/metre"),
+            ("bpi-fine", "bathymetric position index, narrow ring", "metre"),
+            ("bpi-broad", "bathymetric position index, wide ring", "metre"),
+            ("vrm", "vector ruggedness measure", "1"),
+            ("rugosity", "surface area over planar area", "1"),
+            ("roughness", "largest difference in 3 x 3 cells", "metre"),
+            ("tri", "terrain ruggedness index", "metre"),
+            ("tpi", "topographic position index", "metre"),
+        )
+    },
     "mosaic.tif": Layer(_RGB, "uint8", None, mask=True),
     "mosaic-source.tif": Layer(("row of trajectory.csv, from 0",), "int32", -1, resampling="nearest"),
+    "mosaic-painted.tif": Layer(
+        ("1 painted: only images that the laser lights there see it",), "uint8", 0, resampling="nearest"
+    ),
     "mosaic-planar.tif": Layer(_RGB, "uint8", None, mask=True),
 }
 
@@ -136,14 +155,15 @@ class RasterWriter:
             "tiled": True,
             "blockxsize": _BLOCK,
             "blockysize": _BLOCK,
-            "compress": "deflate",
-            "zlevel": 1,
+            "compress": "zstd",  # what is read once again
+            "zstd_level": 1,
             "sparse_ok": True,
             "bigtiff": "if_safer",
         }
         self._file: DatasetWriter | None = None
 
     def __enter__(self) -> Self:
+        self.path.parent.mkdir(exist_ok=True)
         with gdal_settings():
             file = self._file = rasterio.open(self._windows, "w", **self._profile)
             self._describe(file)

@@ -5,23 +5,35 @@ named arrays and a JSON text; it appears whole or not at all, and one that canno
 """
 
 import contextlib
+import errno
 import hashlib
 import io
 import json
 import os
-import threading
+import struct
+import time
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, NamedTuple, TypeVar, cast
 
-import fsspec
 import numpy as np
+from fsspec import AbstractFileSystem
 from fsspec.implementations.local import LocalFileSystem
 from numpy.typing import NDArray
 
-_INFO, _ARRAY = "info.json", ".npy"
-_UNREADABLE = (FileNotFoundError, zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError)
+from .filesystems import asking, connect, write_whole
+from .runs import is_dead, run_name
+
+R = TypeVar("R")
+
+_INFO, _ARRAY, _SCRATCH = "info.json", ".npy", ".tmp"
+_UNREADABLE = (
+    *(FileNotFoundError, zipfile.BadZipFile, zlib.error, struct.error),
+    *(ValueError, KeyError, EOFError, RuntimeError, OverflowError),  # of damaged sizes, names and flags
+)
+# the directory of an entry and its record are at its end: one read of an object store
+_TAIL_BYTES = 64 * 1024
 
 
 def digest(step: str, code_version: str, inputs: Iterable[str], parameters: Any) -> str:
@@ -54,29 +66,69 @@ class Store(NamedTuple):
 
         names : arrays that are wanted, of those that it has; nothing else is read. None: all.
         """
-        filesystem, path = fsspec.url_to_fs(self.path(step, key))
-        try:
-            with filesystem.open(path, "rb") as file:
-                if names is None:  # at one go, as object stores like it
-                    return _unpack(io.BytesIO(file.read()), None)
+        fs, path = connect(self.path(step, key))
+
+        def read() -> Entry:
+            if names is None or not isinstance(fs, LocalFileSystem):  # at one go, as object stores like it
+                return _unpack(io.BytesIO(cast(bytes, fs.cat_file(path))), names)
+            with fs.open(path, "rb") as file:
                 return _unpack(file, names)
-        except _UNREADABLE:
-            return None
+
+        return _unless_damaged(fs, path, read)
 
     def info(self, step: str, key: str) -> dict[str, Any] | None:
         """The record of a result without its arrays, or None when there is none or its directory is damaged."""
-        filesystem, path = fsspec.url_to_fs(self.path(step, key))
-        try:
-            with filesystem.open(path, "rb") as file, zipfile.ZipFile(file) as archive:
-                return json.loads(archive.read(_INFO))
-        except _UNREADABLE:
-            return None
+        fs, path = connect(self.path(step, key))
+
+        def read() -> dict[str, Any]:
+            with _open(fs, path) as file, zipfile.ZipFile(file) as archive:
+                return _read_info(archive)[1]
+
+        return _unless_damaged(fs, path, read)
+
+    def touch(self, step: str, key: str) -> None:
+        """Note that a result was used, for `pruning`; an object store knows only when it was made."""
+        fs, path = connect(self.path(step, key))
+        if isinstance(fs, LocalFileSystem):
+            with contextlib.suppress(OSError):
+                os.utime(path)
 
     def remove(self, step: str, key: str) -> None:
         """Forget a result, so that the next run makes it again."""
-        filesystem, path = fsspec.url_to_fs(self.path(step, key))
-        with contextlib.suppress(FileNotFoundError):
-            filesystem.rm_file(path)
+        fs, path = connect(self.path(step, key))
+        with asking(fs, path), contextlib.suppress(FileNotFoundError):
+            fs.rm_file(path)
+
+    def clean(self) -> None:
+        """Remove what dead runs had not finished writing, and their marks."""
+        fs, folder = connect(f"{self.url}/{_SCRATCH}")
+        with asking(fs, folder), contextlib.suppress(FileNotFoundError):
+            for path in fs.ls(folder, detail=False):
+                with contextlib.suppress(FileNotFoundError):  # finished meanwhile
+                    if is_dead(path.rpartition("/")[2], time.time() - fs.modified(path).timestamp()):
+                        fs.rm_file(path)
+
+    def mark(self) -> str:
+        """Leave a mark by which other processes tell that they see the same store; its name."""
+        name = run_name()
+        write_whole(self._mark(name), name.encode(), f"{self.url}/{_SCRATCH}")
+        return name
+
+    def is_marked(self, name: str) -> bool:
+        fs, path = connect(self._mark(name))
+        try:
+            with asking(fs, path):
+                return fs.cat_file(path) == name.encode()
+        except OSError:
+            return False
+
+    def unmark(self, name: str) -> None:
+        fs, path = connect(self._mark(name))
+        with asking(fs, path), contextlib.suppress(FileNotFoundError):
+            fs.rm_file(path)
+
+    def _mark(self, name: str) -> str:
+        return f"{self.url}/{_SCRATCH}/{name}"
 
     def put(
         self,
@@ -90,42 +142,55 @@ class Store(NamedTuple):
 
         compress : all arrays, none, or the names of those that are worth it.
         """
-        filesystem, path = fsspec.url_to_fs(self.path(step, key))
-        data = _pack(arrays, info, compress)
-        if isinstance(filesystem, LocalFileSystem):
-            temporary = f"{path}.{os.getpid()}-{threading.get_ident()}.tmp"
-            os.makedirs(os.path.dirname(path), exist_ok=True)
-            try:
-                with open(temporary, "wb") as file:
-                    file.write(data)
-                os.replace(temporary, path)
-            finally:
-                if os.path.exists(temporary):
-                    os.remove(temporary)
-        else:
-            filesystem.pipe_file(path, data)
+        write_whole(self.path(step, key), _pack(arrays, info, compress), f"{self.url}/{_SCRATCH}")
+
+
+def _unless_damaged(fs: AbstractFileSystem, path: str, read: Callable[[], R]) -> R | None:
+    """What is read, or None if there is nothing or it is damaged."""
+    try:
+        with asking(fs, path):
+            return read()
+    except _UNREADABLE:
+        return None
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # of a place before the file's beginning
+            raise
+        return None
+
+
+def _open(fs: AbstractFileSystem, path: str) -> Any:
+    if isinstance(fs, LocalFileSystem):
+        return fs.open(path, "rb")
+    return fs.open(path, "rb", block_size=_TAIL_BYTES, cache_type="blockcache")
 
 
 def _pack(arrays: Mapping[str, NDArray], info: Mapping[str, Any], compress: bool | Collection[str]) -> bytes:
     buffer = io.BytesIO()
     squeezed = compress if not isinstance(compress, bool) else arrays if compress else ()
     with zipfile.ZipFile(buffer, "w") as archive:
-        archive.writestr(_INFO, json.dumps(dict(info)))
         for name, array in arrays.items():
             member = io.BytesIO()
             np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
             method = zipfile.ZIP_DEFLATED if name in squeezed else zipfile.ZIP_STORED
             archive.writestr(f"{name}{_ARRAY}", member.getbuffer(), method, compresslevel=1)
+        archive.writestr(_INFO, json.dumps({"arrays": list(arrays), "info": dict(info)}))
     return buffer.getvalue()
 
 
 def _unpack(file: Any, names: Collection[str] | None) -> Entry:
     with zipfile.ZipFile(file) as archive:
-        info = json.loads(archive.read(_INFO))
-        known = [name.removesuffix(_ARRAY) for name in archive.namelist() if name != _INFO]
+        known, info = _read_info(archive)
         arrays = {
             name: np.lib.format.read_array(io.BytesIO(archive.read(f"{name}{_ARRAY}")), allow_pickle=False)
             for name in known
             if names is None or name in names
         }
     return Entry(arrays, info)
+
+
+def _read_info(archive: zipfile.ZipFile) -> tuple[list[str], dict[str, Any]]:
+    """Names of the arrays, and the record; a name damaged in the archive's directory would be an absent array."""
+    found = json.loads(archive.read(_INFO))
+    if [*(f"{name}{_ARRAY}" for name in found["arrays"]), _INFO] != archive.namelist():
+        raise zipfile.BadZipFile("its directory and its record disagree")
+    return found["arrays"], found["info"]

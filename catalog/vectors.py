@@ -1,12 +1,11 @@
-"""survey.gpkg: footprints, track, contours and coverage for a GIS, and how the last two come from rasters."""
+"""survey.gpkg: footprints, track, contours and coverage for a GIS, and how the last comes from a raster."""
 
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 from uuid import uuid4
 
-import contourpy
 import numpy as np
 import pyogrio.raw
 import shapely
@@ -16,8 +15,6 @@ from rasterio import Affine, features
 from .rasters import Overview, horizontal_wkt
 
 Array = NDArray[np.float64]
-_STEPS: Final = (1.0, 2.0, 5.0, 10.0)
-_FINEST_CONTOUR_M: Final = 0.01
 
 
 class Footprint(NamedTuple):
@@ -65,7 +62,7 @@ def write_survey(
     crs_wkt : of the map; of a compound CRS the horizontal part.
     track : (N, 2) or (N, 3) camera centres in map coordinates, in order of time.
     times : (N,) UTC.
-    contours, coverage : see the functions of those names.
+    coverage : by the function of that name.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid4().hex[:8]}.gpkg")
@@ -130,34 +127,6 @@ def _coverage(coverage: shapely.MultiPolygon) -> _Layer:
     present = not coverage.is_empty
     fields = {"area_m2": np.array([coverage.area] if present else [], float)}
     return _Layer("coverage", "MultiPolygon", [coverage] if present else [], fields)
-
-
-def contour_interval(elevation: Array, lines: int = 12) -> float:
-    """A round interval (1, 2 or 5 times a power of ten, metres) for about that many contours; 0.01 m at least."""
-    known = elevation[np.isfinite(elevation)]
-    span = float(np.ptp(np.percentile(known, [1, 99]))) if known.size else 0.0
-    wish = max(span / lines, _FINEST_CONTOUR_M)
-    power = 10.0 ** np.floor(np.log10(wish) + 1e-9)
-    return float(power * min(_STEPS, key=lambda step: abs(np.log(step * power / wish))))
-
-
-def contours(overview: Overview, interval: float) -> list[Contour]:
-    """Contour lines of an elevation raster's overview at whole multiples of an interval, metres."""
-    elevation = np.asarray(overview.values[0], float)
-    known = elevation[np.isfinite(elevation)]
-    if not known.size or min(elevation.shape) < 2:
-        return []
-    rows, cols = elevation.shape
-    generator = contourpy.contour_generator(
-        overview.left_m + (np.arange(cols) + 0.5) * overview.cell_x_m,
-        overview.top_m - (np.arange(rows) + 0.5) * overview.cell_y_m,
-        np.ma.masked_invalid(elevation),
-    )
-    first, last = np.ceil(known.min() / interval), np.floor(known.max() / interval)
-    levels = [round(float(k * interval), 6) for k in np.arange(first, last + 1)]
-    found = (Contour(level, np.asarray(line, float)) for level in levels for line in generator.lines(level))
-    # a line that does not leave a cell is noise, or the point of an extremum
-    return [contour for contour in found if np.ptp(contour.line, axis=0).max() > overview.cell_x_m]
 
 
 def coverage(overview: Overview) -> shapely.MultiPolygon:

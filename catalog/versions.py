@@ -1,44 +1,46 @@
 """Numbered versions of a mission's products: OUT/<mission id>/v1, v2, ...
 
-A version is written in a hidden folder beside them and renamed when it is whole: a version that exists is complete
-and is never written again. Two runs at once each get a number of their own.
+On a disk a version is written in a hidden folder beside them and renamed when it is whole. For an object store it is
+written in a temporary folder of this machine and then uploaded, its provenance last (`publishing`). A version that
+exists is complete and is never written again. Two runs at once each get a number of their own.
 """
 
-import json
 import os
 import re
 import shutil
-import socket
+import tempfile
 import time
 from pathlib import Path
 from typing import Final, NamedTuple, Self
-from uuid import uuid4
 
-PROVENANCE: Final = Path("metadata") / "provenance.json"
-LEASE_S: Final = 24 * 3600.0
+from . import publishing
+from .filesystems import Folder, place
+from .publishing import PROVENANCE, digest_of
+from .runs import LEASE_S, is_dead, run_name
+
+__all__ = ["LEASE_S", "PROVENANCE", "Version", "VersionWriter", "list_versions", "new_version", "newest_version"]
+
 _VERSION: Final = re.compile(r"v([1-9][0-9]*)")
-_UNFINISHED: Final = re.compile(r"\.new-(?P<host>[^ ]*)-(?P<pid>[0-9]+)-[0-9a-f]{8}")
+_UNFINISHED, _STAGED = ".new-", "seamosaic-new-"
 
 
 class Version(NamedTuple):
-    """A finished version."""
+    """A finished version; its path is a `Path`, or on an object store a `UPath`, which is used in the same way."""
 
     number: int
-    path: Path
+    path: Folder
 
     @property
     def digest(self) -> str | None:
         """What it was made from, by its provenance; None if that cannot be read."""
-        try:
-            found = json.loads((self.path / PROVENANCE).read_text(encoding="utf-8"))["digest"]
-        except (OSError, ValueError, KeyError, TypeError):
-            return None
-        return found if isinstance(found, str) else None
+        return digest_of(self.path)
 
 
 def list_versions(out_dir: str | os.PathLike[str], mission_id: str) -> list[Version]:
-    """Finished versions, oldest first."""
-    folder = Path(out_dir) / mission_id
+    """Finished versions of OUT, a folder or URL, oldest first."""
+    folder = place(out_dir) / mission_id
+    if not isinstance(folder, Path):
+        return sorted(Version(number, folder / f"v{number}") for number in publishing.finished(folder))
     if not folder.is_dir():
         return []
     found = [(match, path) for path in folder.iterdir() if (match := _VERSION.fullmatch(path.name)) and path.is_dir()]
@@ -59,18 +61,22 @@ class VersionWriter:
 
     Attributes
     ----------
-    folder : where to write, until the context is left.
+    folder : where to write, on this machine, until the context is left.
     path : the finished version, None before.
     """
 
     def __init__(self, out_dir: str | os.PathLike[str], mission_id: str, digest: str):
-        self._out, self._mission, self._digest = Path(out_dir), mission_id, digest
-        name = f".new-{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
-        self.folder = self._out / mission_id / name
-        self.path: Path | None = None
+        self._out, self._mission, self._digest = out_dir, mission_id, digest
+        self._place = place(out_dir) / mission_id
+        if isinstance(self._place, Path):
+            self.folder = self._place / f"{_UNFINISHED}{run_name()}"
+        else:
+            self.folder = Path(tempfile.gettempdir()) / f"{_STAGED}{run_name()}"
+        self.path: Folder | None = None
 
     def __enter__(self) -> Self:
-        (self.folder / PROVENANCE.parent).mkdir(parents=True)
+        self.folder.mkdir(mode=0o777 if isinstance(self._place, Path) else 0o700, parents=True)
+        (self.folder / PROVENANCE).parent.mkdir()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -80,16 +86,21 @@ class VersionWriter:
         finally:
             shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _commit(self) -> Path:
-        written = Version(0, self.folder).digest
+    def _commit(self) -> Folder:
+        written = digest_of(self.folder)
         if written != self._digest:
             raise ValueError(f"{PROVENANCE} gives the digest {written}, but this version is {self._digest}")
+        if not isinstance(self._place, Path):
+            return publishing.publish(self.folder, self._place, self._digest)
+        return self._rename(self._place)
+
+    def _rename(self, folder: Path) -> Path:
         newest = newest_version(self._out, self._mission)
         if newest is not None and newest.digest == self._digest:
-            return newest.path
+            return Path(str(newest.path))
         number = newest.number + 1 if newest else 1
         while True:
-            path = self._out / self._mission / f"v{number}"
+            path = folder / f"v{number}"
             try:
                 self.folder.rename(path)
                 return path
@@ -102,39 +113,32 @@ class VersionWriter:
             number += 1
 
 
-def new_version(out_dir: str | os.PathLike[str], mission_id: str, digest: str) -> Path | VersionWriter:
+def new_version(out_dir: str | os.PathLike[str], mission_id: str, digest: str) -> Folder | VersionWriter:
     """The newest version's folder if it was made from the same digest, else a writer for the next one.
 
     Leftovers of runs that died are removed on the way.
     """
-    remove_unfinished(Path(out_dir) / mission_id)
+    remove_unfinished(place(out_dir) / mission_id)
     newest = newest_version(out_dir, mission_id)
     if newest is not None and newest.digest == digest:
         return newest.path
     return VersionWriter(out_dir, mission_id, digest)
 
 
-def remove_unfinished(folder: Path) -> None:
+def remove_unfinished(folder: Folder) -> None:
     """Remove the unfinished versions whose run is dead: its process is gone from this host, or, on any host,
     nothing was written for the length of the lease."""
-    if not folder.is_dir():
+    if isinstance(folder, Path):
+        _remove_dead(folder, _UNFINISHED)
         return
-    for path in folder.iterdir():
-        match = _UNFINISHED.fullmatch(path.name)
-        if match and (_is_dead(match["host"], int(match["pid"])) or _quiet_s(path) > LEASE_S):
+    _remove_dead(Path(tempfile.gettempdir()), _STAGED)
+    publishing.remove_unfinished(folder)
+
+
+def _remove_dead(folder: Path, prefix: str) -> None:
+    for path in folder.glob(f"{prefix}*"):
+        if is_dead(path.name.removeprefix(prefix), _quiet_s(path)):
             shutil.rmtree(path, ignore_errors=True)
-
-
-def _is_dead(host: str, pid: int) -> bool:
-    if os.name != "posix" or host != socket.gethostname():  # elsewhere signal 0 is not a question
-        return False
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return True
-    except PermissionError:
-        pass
-    return False
 
 
 def _quiet_s(folder: Path) -> float:
@@ -143,6 +147,6 @@ def _quiet_s(folder: Path) -> float:
     try:
         for path in (folder, *folder.rglob("*")):
             newest = max(newest, path.stat().st_mtime)
-    except FileNotFoundError:
+    except OSError:
         return 0.0
     return time.time() - newest

@@ -3,8 +3,10 @@
 import json
 from pathlib import Path
 
+from .archive import Archive
 from .base import Model
 from .calibration import Calibration
+from .cluster import Cluster
 from .mission import Mission
 from .parameters import Parameters
 from .products import Quality
@@ -13,9 +15,11 @@ from .provenance import Provenance
 FOLDER = Path(__file__).parent / "json"
 
 MODELS: dict[str, type[Model]] = {
+    "archive": Archive,
     "mission": Mission,
     "calibration": Calibration,
     "parameters": Parameters,
+    "cluster": Cluster,
     "quality": Quality,
     "provenance": Provenance,
 }

@@ -124,9 +124,35 @@ class GridParameters(Model):
     ] = "auto"
     max_sigma_m: Annotated[
         Annotated[float, Field(gt=0)] | Literal["auto"],
-        Field(description="interpolated cells less certain than this stay empty, metres, 1-sigma; auto: range / 75"),
+        Field(description="less certain interpolated cells stay empty, metres, 1-sigma; auto: range / 75 or less"),
     ] = "auto"
     tile_cells: Annotated[int, Field(ge=64, le=8192)] = 512
+
+
+class RingParameters(Model):
+    """The ring of a bathymetric position index: how far from a cell its neighbourhood begins and ends."""
+
+    inner: Annotated[float, Field(ge=0, description="where the ring begins")]
+    outer: Annotated[float, Field(gt=0, le=1000, description="where it ends, this distance included")]
+    unit: Annotated[Literal["cells", "metres"], Field(description="of inner and outer")] = "cells"
+
+    @model_validator(mode="after")
+    def _ring_not_empty(self) -> "RingParameters":
+        if self.inner > self.outer:
+            expected = f"at most outer, {self.outer:g}"
+            raise inconsistent("inner", f"{self.inner:g}", expected, "Swap or correct the two.")
+        return self
+
+
+class TerrainParameters(Model):
+    """Habitat layers: slope, aspect, curvature, position, ruggedness, contours."""
+
+    fine: Annotated[RingParameters, Field(description="bathymetric position index of small forms")] = RingParameters(
+        inner=1, outer=5
+    )
+    broad: Annotated[RingParameters, Field(description="bathymetric position index of large forms")] = RingParameters(
+        inner=5, outer=25
+    )
 
 
 class MosaicParameters(Model):
@@ -146,10 +172,14 @@ class MosaicParameters(Model):
 
 
 class MeshParameters(Model):
-    """Textured surface."""
+    """Textured surface: how much of the pyramid in mesh-3dtiles/ goes into the files mesh.glb and mesh.ply."""
 
-    max_triangles: Annotated[int, Field(ge=100, le=20_000_000)] = 400_000
-    texture_px: Annotated[int, Field(ge=256, le=16384, description="longest side of the texture")] = 4096
+    max_triangles: Annotated[
+        int, Field(ge=100, le=20_000_000, description="the finest level with no more than these is taken")
+    ] = 400_000
+    texture_px: Annotated[
+        int, Field(ge=256, le=16384, description="mesh.glb has no more texture than a square of this side, pixels")
+    ] = 6144
 
 
 class Parameters(Model):
@@ -161,5 +191,6 @@ class Parameters(Model):
     adjust: AdjustParameters = AdjustParameters()
     bathymetry: BathymetryParameters = BathymetryParameters()
     grid: GridParameters = GridParameters()
+    terrain: TerrainParameters = TerrainParameters()
     mosaic: MosaicParameters = MosaicParameters()
     mesh: MeshParameters = MeshParameters()

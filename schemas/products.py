@@ -38,13 +38,46 @@ PRODUCTS: Final[tuple[Product, ...]] = (
     Product("density.tif", "Number of soundings in each cell", _COG, "data"),
     Product("source.tif", "Where each cell comes from: 1 laser, 2 image matching, 3 interpolated", _COG, "data"),
     Product("bathymetry.nc", "The four layers above in one CF-NetCDF file", "application/x-netcdf", "data"),
+    Product("terrain/slope.tif", "Steepest slope, degrees (Horn 1981)", _COG, "data"),
+    Product("terrain/aspect.tif", "Where the slope faces, degrees from grid north; none where flat", _COG, "data"),
+    Product(
+        "terrain/profile-curvature.tif",
+        "Curvature down the slope, 1/m, convex positive (Zevenbergen)",
+        _COG,
+        "data",
+    ),
+    Product(
+        "terrain/plan-curvature.tif",
+        "Curvature across the slope, 1/m, ridges positive (Zevenbergen)",
+        _COG,
+        "data",
+    ),
+    Product("terrain/bpi-fine.tif", "Height above a narrow ring around, metres (Lundblad 2006)", _COG, "data"),
+    Product("terrain/bpi-broad.tif", "Height above a wide ring around, metres (Lundblad 2006)", _COG, "data"),
+    Product("terrain/vrm.tif", "Vector ruggedness, 0 smooth to 1 (Sappington 2007)", _COG, "data"),
+    Product("terrain/rugosity.tif", "Area of the surface over that of its map (Jenness 2004)", _COG, "data"),
+    Product("terrain/roughness.tif", "Highest less lowest of 3 x 3 cells, metres (Wilson 2007)", _COG, "data"),
+    Product("terrain/tri.tif", "Mean difference from the eight neighbours, metres (Wilson 2007)", _COG, "data"),
+    Product("terrain/tpi.tif", "Height above the eight neighbours, metres (Wilson 2007)", _COG, "data"),
     Product("mosaic.tif", "Orthomosaic over the 3D model, laser removed", _COG, "visual"),
     Product(
         "mosaic-source.tif", "Which image is behind each mosaic pixel: row of trajectory.csv, from 0", _COG, "data"
     ),
+    Product(
+        "mosaic-painted.tif",
+        "1 where only laser light shows the seabed and colours are those around it, else 0",
+        _COG,
+        "data",
+    ),
     Product("mosaic-planar.tif", "Conventional 2D mosaic that takes the seabed as a plane, to compare", _COG, "visual"),
     Product("mesh.ply", "Coloured surface about a local origin", "application/ply", "data"),
     Product("mesh.glb", "Textured surface about a local origin, for viewers", "model/gltf-binary", "visual"),
+    Product(
+        "mesh-3dtiles/tileset.json",
+        "The whole surface at full detail, as 3D Tiles 1.1: this file names the others",
+        "application/json",
+        "visual",
+    ),
     Product(
         "soundings.laz", "Every accepted laser point with image number, arm and sigma", "application/vnd.laszip", "data"
     ),
@@ -115,6 +148,25 @@ class CalibrationQuality(Model):
     ] = None
 
 
+class PairResidual(Model):
+    """What the adjustment left of one pair of images, root mean squares."""
+
+    images: tuple[str, str]
+    tie_points: Annotated[int, Field(ge=0, description="that both images see")] = 0
+    reprojection_px: Annotated[float | None, Field(ge=0, description="of these, pixels at full resolution")] = None
+    crossovers: Annotated[int, Field(ge=0, description="crossings of their laser lines")] = 0
+    apart_m: Annotated[Metres | None, Field(description="distance of the lines there, along the normal")] = None
+
+
+class ImageResidual(Model):
+    """What the adjustment left of one image."""
+
+    image: str
+    block: Annotated[int, Field(ge=0, description="images of one block hold together without navigation")]
+    reprojection_px: Annotated[float | None, Field(ge=0, description="rms, pixels at full resolution")] = None
+    navigation_minus_adjusted_m: Annotated[Vector | None, Field(description="along x, y, z of the map")] = None
+
+
 class PairQuality(Model):
     """Relative motions between overlapping images."""
 
@@ -123,6 +175,9 @@ class PairQuality(Model):
     homography: Count = 0
     essential: Count = 0
     median_inliers: Annotated[float | None, Field(ge=0)] = None
+    crossed: Annotated[int, Field(ge=0, description="pairs of images whose laser lines cross")] = 0
+    crossover_rms_m: Annotated[Metres | None, Field(description="distance of lines at their crossings")] = None
+    residuals: Annotated[tuple[PairResidual, ...], Field(description="pairs that the adjustment holds")] = ()
 
 
 class AxisDifference(Model):
@@ -151,6 +206,11 @@ class TrajectoryQuality(Model):
     reprojection_rms_px: Annotated[
         float | None, Field(ge=0, description="of tie points from where images see them, pixels at full resolution")
     ] = None
+    blocks: Annotated[
+        tuple[int, ...],
+        Field(description="images in each block that matches or crossovers join, largest first"),
+    ] = ()
+    images: Annotated[tuple[ImageResidual, ...], Field(description="images with a pose, in order of time")] = ()
 
 
 class SourceShares(Model):
@@ -174,19 +234,47 @@ class BathymetryQuality(Model):
     sigma_median_m: Metres | None = None
 
 
+class RingScale(Model):
+    """From how far to how far the ring of a bathymetric position index reaches."""
+
+    inner_cells: Count
+    outer_cells: Count
+    inner_m: Metres
+    outer_m: Metres
+
+
+class TerrainQuality(Model):
+    """The habitat layers in terrain/; figures are medians over cells."""
+
+    slope_deg: Annotated[float | None, Field(ge=0, le=90)] = None
+    vrm: Share | None = None
+    rugosity: Annotated[float | None, Field(ge=0.99)] = None
+    roughness_m: Metres | None = None
+    bpi_fine: RingScale
+    bpi_broad: RingScale
+    contour_interval_m: Annotated[float, Field(gt=0, description="of the contours in survey.gpkg")]
+
+
 class MosaicQuality(Model):
     """The orthomosaic."""
 
     cell_m: Annotated[float, Field(gt=0)]
     area_m2: Annotated[float, Field(ge=0)]
     coverage_share: Annotated[Share | None, Field(description="of the area with an elevation")] = None
+    painted_share: Annotated[
+        Share | None, Field(description="of the mosaic, where only laser light shows the seabed: mosaic-painted.tif")
+    ] = None
 
 
 class MeshQuality(Model):
     """The surface."""
 
-    vertices: Count
-    triangles: Count
+    vertices: Annotated[Count, Field(description="of mesh.ply")]
+    triangles: Annotated[Count, Field(description="of mesh.ply and mesh.glb")]
+    level: Annotated[Count, Field(description="of the pyramid that these two files are, 0 the finest")] = 0
+    error_m: Annotated[Metres | None, Field(description="most that the bathymetry is away from their triangles")] = None
+    tiles: Annotated[Count, Field(description="of all levels, in mesh-3dtiles/")] = 0
+    finest_triangles: Annotated[Count, Field(description="of the finest tiles together")] = 0
 
 
 class Quality(Model):
@@ -198,6 +286,7 @@ class Quality(Model):
     calibration: CalibrationQuality | None = None
     trajectory: TrajectoryQuality | None = None
     bathymetry: BathymetryQuality | None = None
+    terrain: TerrainQuality | None = None
     mosaic: MosaicQuality | None = None
     mesh: MeshQuality | None = None
     warnings: tuple[str, ...] = ()

@@ -37,6 +37,18 @@ class Host(Model):
     cpu_count: Annotated[int, Field(ge=1)]
 
 
+class Request(Model):
+    """What was asked for, as it is known before anything is computed.
+
+    A run that asks for the same as the newest version did has nothing to do.
+    """
+
+    digest: Sha256
+    inputs: Annotated[Sha256, Field(description="of every file of the mission that counts, in its place and role")]
+    parameters: Annotated[dict[str, Any], Field(description="as they were given, automatic values not resolved")]
+    code: Annotated[dict[str, str], Field(description="part of the software to the version of its code")]
+
+
 class Provenance(Model):
     """A provenance.json.
 
@@ -53,4 +65,7 @@ class Provenance(Model):
     inputs: Annotated[dict[str, InputFile], Field(description="path relative to the mission folder")]
     parameters: Annotated[dict[str, Any], Field(description="every parameter, defaults and automatic values resolved")]
     steps: tuple[Step, ...] = ()
+    request: Annotated[
+        Request | None, Field(description="absent where an image could not be read just then: the next run looks again")
+    ] = None
     outputs: dict[str, Sha256] = Field(default_factory=dict, description="path in the version's folder to SHA-256")

@@ -18,6 +18,7 @@ from ..schemas.parameters import AdjustParameters
 from .factors import datum, first_values, gaussian, navigation_factors, optimise, pose, read_poses, robust
 from .motion import Motion
 from .navigation import NavigationPrior, Poses, relative, with_half_turns
+from .residuals import Residuals
 
 Array = NDArray[Any]
 Status = Literal["adjusted", "navigation", "rejected: no link to the first image"]
@@ -53,6 +54,7 @@ class Adjusted(NamedTuple):
     used : (links,) bool, False for links that contradict navigation or each other.
     reprojection_px : rms distance of the tie points from where they are seen; None where none were adjusted.
     turned : (n,) bool, images whose pixels lie the other way round than navigation has them.
+    residuals : what tie points and crossovers left; None where none were adjusted.
     """
 
     poses: Poses
@@ -62,6 +64,7 @@ class Adjusted(NamedTuple):
     used: NDArray[np.bool_]
     turned: NDArray[np.bool_]
     reprojection_px: float | None = None
+    residuals: Residuals | None = None
 
 
 def adjust(
@@ -87,7 +90,8 @@ def adjust(
     values = _solve(graph, usable, start, p.robust_threshold)
     kept = {(link.i, link.j) for link in usable}
     poses = read_poses(values, start)
-    sigma_m, sigma_tilt = sigmas(_total(graph, usable, p.robust_threshold), values, poses, navigation)
+    covariances = _covariances(_total(graph, usable, p.robust_threshold), values, poses)
+    sigma_m, sigma_tilt = sigmas(covariances, poses, navigation)
     return Adjusted(
         poses=poses,
         sigma_m=sigma_m,
@@ -203,34 +207,36 @@ def _agrees(link: Link, values: Any) -> bool:
     return _distance(link.motion, between, link.motion.covariance + _LINK_FLOOR) < 6
 
 
-def sigmas(graph: Any, values: Any, poses: Poses, navigation: NavigationPrior | None) -> tuple[Array, Array]:
-    """Sigmas (n, 3) of the camera centres along the local axes and (n,) of the lean of the optical axes."""
-    marginals = _marginals(graph, values)
-    count = len(poses.C_local)
-    position, tilt = np.full((count, 3), np.nan), np.full(count, np.nan)
-    for k in np.flatnonzero(poses.known).tolist():
-        R, covariance = poses.R_local_camera[k], marginals.marginalCovariance(k)
-        position[k] = np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T))
-        tilt[k] = np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)
+def sigmas(covariances: Array, poses: Poses, navigation: NavigationPrior | None) -> tuple[Array, Array]:
+    """Sigmas (n, 3) of the camera centres along the local axes and (n,) of the lean of the optical axes.
+
+    covariances : (n, 6, 6) of GTSAM's increments R exp(w), C + R v.
+    """
+    R = poses.R_local_camera
+    along = np.einsum("nij,njk,nik->ni", R, covariances[:, 3:, 3:], R)
+    position, tilt = np.sqrt(along), np.sqrt((covariances[:, 0, 0] + covariances[:, 1, 1]) / 2)
     if navigation is not None:  # roll and pitch err by a bias too, which no number of images averages down
         tilt = np.hypot(tilt, navigation.sigma_attitude[:, :2].mean(1))
     return position, tilt
 
 
-def _marginals(graph: Any, values: Any) -> Any:
-    """What tells the covariance of each variable.
+def _covariances(graph: Any, values: Any, poses: Poses) -> Array:
+    """Covariances (n, 6, 6) of the poses, NaN where there is none.
 
     That a map may move as a whole by decimetres, but its parts by tenths of millimetres, can be too much for Cholesky
     factors; QR bears it, for several times the memory.
     """
     try:
-        return gtsam.Marginals(graph, values)
+        marginals = gtsam.Marginals(graph, values)
     except RuntimeError:
         p = gtsam.ISAM2Params()
         p.setFactorization("QR")
-        by_qr = gtsam.ISAM2(p)
-        by_qr.update(graph, values)
-        return by_qr
+        marginals = gtsam.ISAM2(p)
+        marginals.update(graph, values)
+    found = np.full((len(poses.C_local), 6, 6), np.nan)
+    for k in np.flatnonzero(poses.known).tolist():
+        found[k] = marginals.marginalCovariance(k)
+    return found
 
 
 def _status(links: list[Link], poses: Poses, navigation: NavigationPrior | None) -> list[Status]:

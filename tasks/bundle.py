@@ -14,12 +14,15 @@ from numpy.typing import NDArray
 
 from ..schemas.calibration import Camera
 from ..schemas.parameters import AdjustParameters
-from . import laser_ranges
+from . import crossovers, laser_ranges
+from . import residuals as remaining
 from .adjust import Adjusted, sigmas
 from .camera import ground_sample_distance, normalised
-from .factors import datum, first_values, navigation_factors, optimise, read_poses
+from .crossovers import Crossovers, Lines
+from .factors import datum, first_values, navigation_factors
 from .laser_ranges import Ranges
 from .navigation import NavigationPrior, Poses, with_half_turns
+from .reduction import Observations, State, covariances, observations, solve
 from .tracks import Sights
 
 Array = NDArray[Any]
@@ -29,13 +32,13 @@ _LEAST_PARALLAX = 0.015  # radians
 # before each round, what is farther off is a wrong match: pixels, but not less than sigmas
 _GATES_PX, _GATE_SIGMAS = (100.0, 10.0, 1.0, 0.5), 5.0
 _TOLERANCES = 1e-2, 1e-2, 1e-3, 3e-4  # of each round: what the next one changes anyhow need not be found to the end
-_ANYWHERE_M = 100.0  # a sigma beyond this is no knowledge
+_LEAST_SIGHTS = 4  # of an image that tie points hold: three leave several poses
 _COVARIANCE_SIGMA_PX = 1.0  # of sights, for the covariances: what calibration leaves is shared by many
 _RANGE_GATE = 6.0  # sigmas
-# The errors of ranges beside each other are alike. Sights hold an image against that; one that has none, as laser
-# images have, would slide down the slopes of such errors, so its ranges count as if they were so many times worse.
-_BLIND = 20.0
-_RANGE_STEP = 1.1  # ratio of neighbouring sigmas that have a noise model of their own
+# Ranges beside each other are carried along one slope and err alike. Sights hold an image against that; where it has
+# none, as laser images have, so many ranges count as one.
+_ALIKE = 12
+_SLOPE_SIGMA = 0.03
 _MAD_TO_SIGMA = 1.4826
 
 
@@ -46,7 +49,7 @@ class Block(NamedTuple):
     ----------
     sights : of tie points, wrong matches left out. x : (M, 2) their slopes.
     X : (N, 3) tie points, local. focal_px : pixels a slope.
-    ranges : of the laser. roughness : see `laser_ranges`.
+    ranges : of the laser. roughness : see `laser_ranges`. crossed : laser lines of different images.
     """
 
     sights: Sights
@@ -55,6 +58,7 @@ class Block(NamedTuple):
     focal_px: float
     ranges: Ranges
     roughness: float
+    crossed: Crossovers
 
 
 class Bundle(NamedTuple):
@@ -77,27 +81,50 @@ def adjust(
     chained: Adjusted,
     sights: Sights,
     soundings: Mapping[int, Array],
+    lines: Lines,
     navigation: NavigationPrior | None,
     p: AdjustParameters,
 ) -> Adjusted:
-    """The poses of `tasks.adjust.adjust` made better by tie points and laser ranges, with their sigmas.
+    """The poses of `tasks.adjust.adjust` made better by tie points and the laser, with their sigmas.
 
     sights : tie points of the links that `chained` used. soundings : (L, 3) of images with a laser, camera frame.
+    lines : the same soundings as lines that cross each other.
     """
     if navigation is not None:
         navigation = with_half_turns(navigation, chained.turned)
     try:
-        found = refine(camera, chained.poses, sights, soundings, navigation, p)
+        found = refine(camera, chained.poses, sights, soundings, lines, navigation, p)
         if found is None:
             return chained
-        graph, values = _graph(found.poses, found.block, _COVARIANCE_SIGMA_PX, navigation, p)
-        sigma_m, sigma_tilt = sigmas(graph, values, found.poses, navigation)
-    except (RuntimeError, IndexError):  # GTSAM: something that nothing holds, such as the scale without a laser
+        sigma_m, sigma_tilt = sigmas(_covariances(found, navigation, p), found.poses, navigation)
+    except RuntimeError:  # GTSAM: a system too near to singular, which counting alone cannot foresee
         return chained
-    if not (sigma_m[found.poses.known] < _ANYWHERE_M).all():
-        return chained
-    rms_px = float(np.sqrt((found.residual_px**2).sum(1).mean()))
-    return chained._replace(poses=found.poses, sigma_m=sigma_m, sigma_tilt_rad=sigma_tilt, reprojection_px=rms_px)
+    rms_px = float(np.sqrt((found.residual_px**2).sum(1).mean())) if len(found.residual_px) else None
+    count = len(chained.status)
+    held = _by_laser(found, lines, count)
+    return chained._replace(
+        poses=found.poses,
+        sigma_m=sigma_m,
+        sigma_tilt_rad=sigma_tilt,
+        reprojection_px=rms_px,
+        residuals=remaining.of(count, found.block.sights, found.residual_px, found.block.crossed),
+        status=["adjusted" if ok else status for status, ok in zip(chained.status, held, strict=True)],
+    )
+
+
+def _by_laser(found: Bundle, lines: Lines, count: int) -> NDArray[np.bool_]:
+    """Which of `count` images the laser holds to others where no feature can.
+
+    None where images with a laser have tie points: one among them that has none is in doubt, and lines cross in a
+    wrong place, too.
+    """
+    block = found.block
+    if np.isin(lines.image, block.sights.image).any():
+        return np.zeros(count, bool)
+    ranged = np.bincount(block.ranges.image, minlength=count) >= crossovers.LEAST_OF_IMAGE * _ALIKE
+    every = crossovers.find(found.poses, lines)
+    kept = crossovers.believable(every, crossovers.LEAST_OF_IMAGE * len(np.unique(lines.image)))
+    return ranged | crossovers.holds(every, kept, count)
 
 
 def refine(
@@ -105,46 +132,96 @@ def refine(
     start: Poses,
     sights: Sights,
     soundings: Mapping[int, Array],
+    lines: Lines,
     navigation: NavigationPrior | None,
     p: AdjustParameters,
 ) -> Bundle | None:
-    """The poses that have a start, adjusted together; None where images see no tie point in common.
+    """The poses that have a start, adjusted together.
 
-    soundings : (L, 3) of each image with a laser, camera frame.
+    None where images share no tie point and no laser line crosses, or, without navigation, where tie points and laser
+    leave an image or the scale open.
+
+    soundings : (L, 3) of each image with a laser, camera frame. lines : the same as lines.
     """
     lit = {k: own for k, own in soundings.items() if start.known[k] and len(own)}
     depth = float(np.median([np.median(own[:, 2]) for own in lit.values()])) if lit else 3.0
     sights = sights.take(start.known[sights.image])
-    bundle, poses = None, start
+    fixed = _fixed(start, navigation)
+    bundle, poses, unknowns, values = None, start, 0, first_values(fixed, start)
     sigma_px, rough = _FIRST_SIGMA_PX, laser_ranges.FIRST_ROUGHNESS
     for gate_px, tolerance in zip(_GATES_PX, _TOLERANCES, strict=True):
         gate_px = max(gate_px, _GATE_SIGMAS * sigma_px)
         sights, x, X, focal_px = _inliers(camera, poses, sights, depth, gate_px)
-        if not len(X):
+        crossed = crossovers.believable(crossovers.find(poses, lines), unknowns)
+        if not len(X) and not len(crossed.i):
             return None
         ranges = _believable(poses, X, laser_ranges.measure(poses, X, lit, p.max_ranges), rough)
-        graph, values = _graph(poses, Block(sights, x, X, focal_px, ranges, rough), sigma_px, navigation, p)
-        values = optimise(graph, values, tolerance)
-        poses = read_poses(values, poses)
-        X = np.array([values.atPoint3(_tie_point(n)) for n in range(len(X))])
+        if navigation is None and not determined(poses.known, sights, ranges):
+            return None
+        block = Block(sights, x, X, focal_px, ranges, rough, crossed)
+        o, afloat = _observations(block, poses, sigma_px, p), navigation is not None
+        crossing = _with_crossovers(fixed, block, State(values, poses, X), p)
+        values, poses, X = solve(crossing, State(values, poses, X), o, tolerance, afloat)
         residual_px = residuals(poses, sights, x, X) * focal_px
         sigma_px, rough = _noise_px(residual_px, len(X)), laser_ranges.roughness(poses, X, ranges)
-        bundle = Bundle(poses, Block(sights, x, X, focal_px, ranges, rough), residual_px, sigma_px)
+        unknowns = crossovers.LEAST_OF_IMAGE * len(np.union1d(crossed.i, crossed.j))
+        bundle = Bundle(poses, block._replace(X=X, roughness=rough), residual_px, sigma_px)
     return bundle
 
 
-def _graph(
-    poses: Poses, block: Block, sigma_px: float, navigation: NavigationPrior | None, p: AdjustParameters
-) -> tuple[Any, Any]:
-    """GTSAM's graph and the values to start from."""
-    first = int(np.flatnonzero(poses.known)[0])
-    graph = navigation_factors(navigation) if navigation else datum(poses, first)
-    values = first_values(graph, poses)
-    _add_sights(graph, values, block.sights, block.x, block.X, sigma_px / block.focal_px, p.robust_threshold)
+def determined(known: NDArray[np.bool_], sights: Sights, ranges: Ranges) -> bool:
+    """Whether tie points join all images that have a pose (n,), and ranges of images that see them give the scale."""
+    if not np.isin(ranges.image, sights.image).any():
+        return False
+    count = len(known)
+    seen = np.bincount(sights.image, minlength=count)
+    joined = remaining.blocks(count + sights.tie_points, np.column_stack([sights.image, count + sights.track]))[:count]
+    return bool((seen[known] >= _LEAST_SIGHTS).all()) and len(np.unique(joined[known])) == 1
+
+
+def _fixed(poses: Poses, navigation: NavigationPrior | None) -> Any:
+    """What holds the poses besides tie points and crossovers, as a GTSAM graph."""
+    return navigation_factors(navigation) if navigation else datum(poses, int(np.flatnonzero(poses.known)[0]))
+
+
+def _with_crossovers(fixed: Any, block: Block, at: State, p: AdjustParameters) -> Any:
+    graph = gtsam.NonlinearFactorGraph(fixed)
+    crossovers.add(graph, at.values, at.poses, block.crossed, 2 * p.robust_threshold)
+    return graph
+
+
+def _observations(block: Block, poses: Poses, sigma_px: float, p: AdjustParameters) -> Observations:
+    """Cauchy's kernel at twice the threshold of pair motions: a wrong match must not pull, however many it has."""
     sigma_m = laser_ranges.sigma(block.ranges.away_m, block.roughness)
     blind = ~np.isin(block.ranges.image, block.sights.image)
-    _add_ranges(graph, block.ranges, np.where(blind, _BLIND * sigma_m, sigma_m), p.robust_threshold)
-    return graph, values
+    sigma_m = np.where(blind, np.sqrt(_ALIKE) * sigma_m, sigma_m)
+    ranges, normal = _along_normals(poses, block.X, block.ranges, blind)
+    sigma = sigma_px / block.focal_px
+    return observations(block.sights, block.x, sigma, ranges, sigma_m, normal, 2 * p.robust_threshold)
+
+
+def _along_normals(poses: Poses, X: Array, ranges: Ranges, blind: NDArray[np.bool_]) -> tuple[Ranges, Array]:
+    """Ranges of images that see no tie point as distances along normals (K, 3), camera frames, 0 for the others.
+
+    Their laser lies on the surface that the tie points of others make. A range would hold such a camera by the
+    direction in which it looks; a surface holds it along its normal alone, which is all that a laser without features
+    knows.
+    """
+    R = poses.R_local_camera[ranges.image]
+    away = X[ranges.track] - poses.C_local[ranges.image]
+    height = away[:, 2] * ranges.range_m / np.linalg.norm(away, axis=1)
+    lit = np.column_stack([away[:, :2], height])
+    normal = crossovers.normals(ranges.slope, np.full(len(away), _SLOPE_SIGMA))
+    distance = np.where(blind, (lit * normal).sum(1), ranges.range_m)
+    return ranges._replace(range_m=distance), np.einsum("kji,kj->ki", R, normal) * blind[:, None]
+
+
+def _covariances(found: Bundle, navigation: NavigationPrior | None, p: AdjustParameters) -> Array:
+    """Covariances (n, 6, 6) of the poses."""
+    fixed = _fixed(found.poses, navigation)
+    state = State(first_values(fixed, found.poses), found.poses, found.block.X)
+    o = _observations(found.block, found.poses, _COVARIANCE_SIGMA_PX, p)
+    return covariances(_with_crossovers(fixed, found.block, state, p), state, o)
 
 
 def _inliers(camera: Camera, poses: Poses, sights: Sights, depth: float, gate_px: float):
@@ -196,39 +273,13 @@ def _believable(poses: Poses, X: Array, ranges: Ranges, rough: float) -> Ranges:
     left = np.linalg.norm(X[ranges.track] - poses.C_local[ranges.image], axis=1) - ranges.range_m
     level = np.median(left) if len(left) else 0.0  # what all have in common is the scale that they are to tell
     keep = np.abs(left - level) < _RANGE_GATE * laser_ranges.sigma(ranges.away_m, rough)
-    return Ranges(*(values[keep] for values in ranges))
-
-
-def _tie_point(number: int) -> int:
-    return gtsam.symbol("x", number)
-
-
-def _robust(noise: Any, threshold: float) -> Any:
-    """Cauchy's kernel at twice the threshold of pair motions: a wrong match must not pull, however many it has."""
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(2 * threshold), noise)
-
-
-def _add_sights(graph: Any, values: Any, sights: Sights, x: Array, X: Array, sigma: float, threshold: float) -> None:
-    noise, pinhole = _robust(gtsam.noiseModel.Isotropic.Sigma(2, sigma), threshold), gtsam.Cal3_S2()
-    for number, point in enumerate(X):
-        values.insert(_tie_point(number), point)
-    for image, track, seen in zip(sights.image.tolist(), sights.track.tolist(), x, strict=True):
-        graph.add(gtsam.GenericProjectionFactorCal3_S2(seen, noise, image, _tie_point(track), pinhole))
-
-
-def _add_ranges(graph: Any, ranges: Ranges, sigma: Array, threshold: float) -> None:
-    level = np.round(np.log(sigma) / np.log(_RANGE_STEP)).astype(int)
-    noises = {
-        k: _robust(gtsam.noiseModel.Isotropic.Sigma(1, float(_RANGE_STEP**k)), threshold)
-        for k in np.unique(level).tolist()
-    }
-    columns = (ranges.image.tolist(), ranges.track.tolist(), ranges.range_m.tolist(), level.tolist())
-    for image, track, range_m, k in zip(*columns, strict=True):
-        graph.add(gtsam.RangeFactor3D(image, _tie_point(track), range_m, noises[k]))
+    return ranges.take(keep)
 
 
 def _noise_px(residual_px: Array, points: int) -> float:
     """1-sigma of a sight along either axis, from the residuals that the adjustment left."""
+    if not residual_px.size:
+        return _FIRST_SIGMA_PX
     freedom = max(0.2, 1 - 3 * points / max(1, residual_px.size))
     spread = _MAD_TO_SIGMA * float(np.median(np.abs(residual_px))) / np.sqrt(freedom)
     return float(np.clip(spread, *_SIGMA_PX))

@@ -17,16 +17,17 @@ _FOOT_M = 0.05
 _MOST_BESIDE_A_PAIR = 20
 
 
-def crossings(points: Points, X_local: Array) -> Crossings:
+def crossings(points: Points, X_local: Array, longest_m: float = _LONGEST_SEGMENT_M) -> Crossings:
     """Crossings, seen from above, of lines of light; of different images, or of both arms of one.
 
     Parameters
     ----------
     points : by image, arm and row. X_local : (P, 3) metres.
+    longest_m : distance of neighbouring points beyond which the line is broken.
     """
     first = np.flatnonzero((np.diff(points.image) == 0) & (np.diff(points.arm) == 0))
     length = np.linalg.norm(X_local[first + 1, :2] - X_local[first, :2], axis=1)
-    first = first[np.isfinite(length) & (length < _LONGEST_SEGMENT_M) & (length > 0)]
+    first = first[np.isfinite(length) & (length < longest_m) & (length > 0)]
     ends = np.stack([X_local[first, :2], X_local[first + 1, :2]], axis=1)
     segments = np.asarray(shapely.linestrings(ends))
     a, b = shapely.STRtree(segments).query(segments, predicate="intersects")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..schemas.calibration import Camera
 from .camera import normalised, outline, project, rays
+from .dense_refine import Refined
 from .navigation import Poses
 from .nodes import upsample
 from .projection import look_up
@@ -73,10 +74,18 @@ class Sight(NamedTuple):
 
 
 class Relief(NamedTuple):
-    """Points (N, 3) of the pair's surface, local, and 1-sigma (N,) of their elevations for a pixel of disparity, m."""
+    """Points of a pair's surface.
+
+    Attributes
+    ----------
+    X_local : (N, 3) m.
+    metres_per_px : (N,) 1-sigma of the elevation for a pixel of disparity, m.
+    noise_px : (N,) 1-sigma of the disparity by the noise of the images.
+    """
 
     X_local: Array
     metres_per_px: Array
+    noise_px: Array
 
 
 def rectify(
@@ -215,8 +224,9 @@ def disparity(made: Rectified, first: tuple[Pixels, Mask], second: tuple[Pixels,
     return np.where(good, found, np.float32(np.nan))
 
 
-def points(made: Rectified, found: Array, first: Sight, second: Sight) -> Relief:
+def points(made: Rectified, matched: Refined, first: Sight, second: Sight) -> Relief:
     """The points of a disparity image, by the exact rays of both cameras."""
+    found = matched.disparity
     row, column = np.nonzero(np.isfinite(found[::_EVERY, ::_EVERY]))
     row, column = row * _EVERY, column * _EVERY
     moved = column - found[row, column].astype(float)
@@ -227,7 +237,7 @@ def points(made: Rectified, found: Array, first: Sight, second: Sight) -> Relief
     Z = (made.base_m + a_j - a_i) / (s_i - s_j)
     X = np.column_stack([a_i + s_i * Z, a_y + s_y * Z, Z])
     sigma = Z**2 / (made.focal_px * made.base_m) * np.abs(made.R_local_rect[2, 2])
-    return Relief(made.C_local + X @ made.R_local_rect.T, sigma)
+    return Relief(made.C_local + X @ made.R_local_rect.T, sigma, matched.sigma_px[row, column].astype(float))
 
 
 def _lines(seen: Sight, x: Array, y: Array, x_slope: Array, y_slope: Array) -> tuple[Array, Array, Array, Array]:

@@ -17,6 +17,9 @@ _STEEPEST = 1.0  # rise over run from the points known to a cell among them
 _NEAR_PX = 2.0
 _ONE_SIGMA = 0.6827
 _LEAST_COMPARED = 30
+_AROUND = 12  # cells that soundings are compared with,
+_BLOCK_CELLS, _LEAST_IN_BLOCK = 25, 12
+_AROUND_CELLS, _OFF_CENTRE = 4.5, 1.5  # none farther than this many cells, their middle no farther than that many
 
 
 class PairCells(NamedTuple):
@@ -27,17 +30,19 @@ class PairCells(NamedTuple):
     X_map : (M, 3) mean position and median elevation of the cell's points, m.
     metres_per_px : (M,) 1-sigma of the elevation for a pixel of disparity, m.
     borne_out : (M,) whether laser and tie points around it say the same, within what terrain may do between them.
+    noise_px : (M,) 1-sigma of the disparity by the noise of the images.
     """
 
     X_map: Array
     metres_per_px: Array
     borne_out: Mask
+    noise_px: Array
 
 
-NO_CELLS = PairCells(np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool))
+NO_CELLS = PairCells(np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool), np.zeros(0))
 
 
-def reduce_to_cells(X_map: Array, metres_per_px: Array, known_map: Array, cell_m: float) -> PairCells:
+def reduce_to_cells(X_map: Array, metres_per_px: Array, noise_px: Array, known_map: Array, cell_m: float) -> PairCells:
     """Cells of the points (N, 3) of a pair, map coordinates; known_map : (K, 3) laser and tie points around."""
     key = np.floor(X_map[:, :2] / cell_m).astype(np.int64)
     order = np.lexsort((X_map[:, 2], key[:, 0], key[:, 1]))
@@ -49,9 +54,10 @@ def reduce_to_cells(X_map: Array, metres_per_px: Array, known_map: Array, cell_m
         return NO_CELLS
     X, count = X_map[order], np.bincount(group)
     base = X[0]  # eastings of a million metres lose no digits
-    x, y, scale = (np.bincount(group, v) / count for v in (X[:, 0] - base[0], X[:, 1] - base[1], metres_per_px[order]))
+    means = (X[:, 0] - base[0], X[:, 1] - base[1], metres_per_px[order], noise_px[order])
+    x, y, scale, noise = (np.bincount(group, v) / count for v in means)
     cells = np.column_stack([x + base[0], y + base[1], group_median(group, X[:, 2])])
-    return PairCells(cells, scale, _borne_out(cells, scale, known_map))
+    return PairCells(cells, scale, _borne_out(cells, scale, known_map), noise)
 
 
 def _borne_out(X: Array, metres_per_px: Array, known: Array) -> Mask:
@@ -75,15 +81,58 @@ class Differences(NamedTuple):
     px: Array
 
 
+NO_DIFFERENCES = Differences(np.zeros(0), np.zeros(0))
+
+
 def differences(X_map: Array, metres_per_px: Array, laser_map: Array, within_m: float) -> Differences:
     """Differences in elevation of points (N, 3) from the laser's nearest sounding, where one is near."""
     if not len(laser_map) or not len(X_map):
-        return Differences(np.zeros(0), np.zeros(0))
+        return NO_DIFFERENCES
     base = laser_map[0, :2]
     away, nearest = (np.asarray(v) for v in KDTree(laser_map[:, :2] - base).query(X_map[:, :2] - base))
     near = away < within_m
     off = X_map[near, 2] - laser_map[nearest[near], 2]
     return Differences(off, off / metres_per_px[near])
+
+
+def departures(X_map: Array, metres_per_px: Array, laser_map: Array, cell_m: float) -> Differences:
+    """Differences of matched cells (M, 3) from one image's soundings (L, 3), without what single ones err by.
+
+    The plane through the cells around, less the mean of the soundings of a cell where those lie; of that the medians
+    of blocks some decimetres wide. So neither slopes nor noise nor roughness count, and what is left is what the poses
+    do to either.
+    """
+    if len(X_map) < _AROUND or not len(laser_map):
+        return NO_DIFFERENCES
+    base = X_map.mean(0)
+    cells, at = X_map - base, _means(laser_map - base, cell_m)
+    away, near = (np.asarray(v) for v in KDTree(cells[:, :2]).query(at[:, :2], k=_AROUND))
+    beside = cells[near] - at[:, None]
+    centred = np.hypot(*beside[..., :2].mean(1).T) < _OFF_CENTRE * cell_m
+    good = centred & (away[:, -1] < _AROUND_CELLS * cell_m)
+    if not good.any():
+        return NO_DIFFERENCES
+    design = np.concatenate([np.ones((*beside.shape[:2], 1)), beside[..., :2] / cell_m], -1)[good]
+    normal = np.einsum("nki,nkj->nij", design, design) + 1e-6 * np.eye(3)
+    plane = np.linalg.solve(normal, np.einsum("nki,nk->ni", design, beside[good, :, 2])[..., None])
+    off, scale = plane[:, 0, 0], metres_per_px[near[good, 0]]
+    _, block = np.unique(np.floor(at[good, :2] / (_BLOCK_CELLS * cell_m)), axis=0, return_inverse=True)
+    order = np.argsort(block.reshape(-1), kind="stable")
+    block, off, scale = block.reshape(-1)[order], off[order], scale[order]
+    enough = np.bincount(block) >= _LEAST_IN_BLOCK
+    middle = group_median(block, off)
+    scatter = 1.48 * group_median(block, np.abs(off - middle[block]))
+    # of a median over that many; what it could be by chance does not count
+    chance = 1.25 * scatter / np.sqrt(np.bincount(block))
+    metres = np.sqrt(np.maximum(middle**2 - chance**2, 0))[enough]
+    return Differences(metres, metres / group_median(block, scale)[enough])
+
+
+def _means(X: Array, cell_m: float) -> Array:
+    """Mean points (M, 3) of the cells that some points (N, 3) lie in."""
+    _, group = np.unique(np.floor(X[:, :2] / cell_m).astype(np.int64), axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    return np.column_stack([np.bincount(group, column) for column in X.T]) / np.bincount(group)[:, None]
 
 
 def share_of_each(off: Array, otherwise: float) -> float:

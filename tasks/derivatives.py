@@ -1,17 +1,49 @@
 """Layers that analysts derive from bathymetry: slope, aspect, curvature, position, ruggedness; NaN where there is none.
 
-Elevations are (rows, columns) float64, metres, row 0 north, NaN for no data; a value needs all cells of its window, so
-a tile with a rim of `reach` cells has the values of the whole map, bit for bit.
+Elevations are (rows, columns) float64, metres, row 0 north, NaN for no data; a value needs all cells of its window (of
+a ring, half), so a tile with a rim of `reach` cells has the values of the whole map, bit for bit.
 """
 
-from typing import Any
+import math
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-FLAT_DEG = 0.05  # less slope has no aspect
+FLAT_DEG: Final = 0.05  # less slope has no aspect
+_FIXED_POINT: Final = 2.0**24  # of a metre: holds all bits of a float32 that is not within half a metre of zero
+
+
+class Ring(NamedTuple):
+    """The cells whose centres are from inner to outer cells away."""
+
+    inner_cells: int
+    outer_cells: int
+
+
+LAYERS: Final = (
+    *("slope", "aspect", "profile-curvature", "plan-curvature", "bpi-fine", "bpi-broad"),
+    *("vrm", "rugosity", "roughness", "tri", "tpi"),
+)
+
+
+def layers(z: Array, cell_m: float, fine: Ring, broad: Ring) -> dict[str, Array]:
+    """All of LAYERS of elevations, float32; the position indices `bpi-fine` and `bpi-broad` by these rings."""
+    found = (
+        slope_deg(z, cell_m),
+        aspect_deg(z, cell_m),
+        *curvatures(z, cell_m),
+        benthic_position(z, fine),
+        benthic_position(z, broad),
+        vector_ruggedness(z, cell_m),
+        surface_rugosity(z, cell_m),
+        roughness(z),
+        ruggedness(z),
+        position(z),
+    )
+    return {name: values.astype(np.float32) for name, values in zip(LAYERS, found, strict=True)}
 
 
 def _around(z: Array) -> list[Array]:
@@ -46,8 +78,8 @@ def aspect_deg(z: Array, cell_m: float) -> Array:
 def curvatures(z: Array, cell_m: float) -> tuple[Array, Array]:
     """Profile and plan curvature, 1/m (Zevenbergen & Thorne 1987): along the slope and across it; 0 where level.
 
-    Positive profile curvature: the slope grows less steep downhill (concave). Positive plan curvature: flow diverges
-    (a ridge).
+    Positive where convex: a profile that steepens downhill, a ridge from which flow diverges. These are SAGA's
+    longitudinal and cross-sectional curvature of method 6; ArcGIS's profile curvature has the other sign.
     """
     nw, n, ne, w, e, sw, s, se = _around(z)
     D, E = ((w + e) / 2 - z) / cell_m**2, ((n + s) / 2 - z) / cell_m**2
@@ -56,7 +88,7 @@ def curvatures(z: Array, cell_m: float) -> tuple[Array, Array]:
     steep = G**2 + H**2
     level = steep < 1e-12
     with np.errstate(invalid="ignore", divide="ignore"):
-        profile = 2 * (D * G**2 + E * H**2 + F * G * H) / steep
+        profile = -2 * (D * G**2 + E * H**2 + F * G * H) / steep
         plan = -2 * (D * H**2 + E * G**2 - F * G * H) / steep
     return np.where(level, 0.0, profile), np.where(level, 0.0, plan)
 
@@ -77,25 +109,39 @@ def position(z: Array) -> Array:
     return z - np.sum(_around(z), axis=0) / 8
 
 
-def benthic_position(z: Array, inner_cells: int, outer_cells: int) -> Array:
-    """Bathymetric position index: elevation above the mean of a ring, m (Lundblad et al. 2006).
+def benthic_position(z: Array, ring: Ring) -> Array:
+    """Bathymetric position index: elevation above the mean of a ring, m (Lundblad et al. 2006; SAGA's TPI).
 
-    The ring has the cells whose centres are from inner_cells to outer_cells away; cells without data do not count, and
-    where half of the ring or more is missing there is no value.
+    Cells without data do not count, and where half of the ring or more is missing there is no value.
     """
-    reach = np.arange(-outer_cells, outer_cells + 1)
-    away2 = reach[:, None] ** 2 + reach**2
-    ring = np.argwhere((away2 >= inner_cells**2) & (away2 <= outer_cells**2))
-    wide = np.pad(z, outer_cells, constant_values=np.nan)
-    total, count = np.zeros(z.shape), np.zeros(z.shape)
-    for i, j in ring.tolist():
-        part = wide[i : i + z.shape[0], j : j + z.shape[1]]
-        known = np.isfinite(part)
-        # sums in one order whatever the tile, so tiles agree bit for bit
-        total += np.where(known, part, 0.0)
-        count += known
+    inner, outer = ring
+    known = np.isfinite(z)
+    # whole numbers: their sums do not depend on where a tile begins
+    heights = np.where(known, np.rint(np.nan_to_num(z) * _FIXED_POINT), 0).astype(np.int64)
+    total, count = (_ring_sum(layer, ring) for layer in (heights, known.astype(np.int64)))
+    away2 = np.arange(-outer, outer + 1)[:, None] ** 2 + np.arange(-outer, outer + 1) ** 2
+    cells = ((away2 >= inner**2) & (away2 <= outer**2)).sum()
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(2 * count > len(ring), z - total / count, np.nan)
+        return np.where(2 * count > cells, z - total / count / _FIXED_POINT, np.nan)
+
+
+def _ring_sum(values: NDArray[np.int64], ring: Ring) -> NDArray[np.int64]:
+    """Sum of the whole numbers in the ring around each cell, from sums along its rows."""
+    inner, outer = ring
+    rows, columns = values.shape
+    before = np.cumsum(np.pad(values, ((outer, outer), (outer + 1, outer))), axis=1)
+    total = np.zeros(values.shape, np.int64)
+    for down in range(-outer, outer + 1):
+        line = before[down + outer : down + outer + rows]
+        total += _along(line, columns, outer, math.isqrt(outer**2 - down**2))
+        if abs(down) < inner:
+            total -= _along(line, columns, outer, math.isqrt(inner**2 - down**2 - 1))
+    return total
+
+
+def _along(before: NDArray[np.int64], columns: int, outer: int, half: int) -> NDArray[np.int64]:
+    """Sums (rows, columns) of the cells up to half away along their row; before: sums up to each cell, padded."""
+    return before[:, outer + half + 1 : outer + half + 1 + columns] - before[:, outer - half : outer - half + columns]
 
 
 def vector_ruggedness(z: Array, cell_m: float) -> Array:
@@ -121,6 +167,6 @@ def surface_rugosity(z: Array, cell_m: float) -> Array:
     return area / cell_m**2
 
 
-def reach(outer_cells: int) -> int:
-    """Rim of cells that a tile needs for all of these layers, the ring of the largest position index included."""
-    return max(2, outer_cells)
+def reach(broad: Ring) -> int:
+    """Rim of cells that a tile needs for all of these layers, of which the largest ring is that one."""
+    return max(2, broad.outer_cells)

@@ -9,7 +9,6 @@ from typing import Any
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from .navigation import NavigationPrior, Poses, relative, walk_m
 
@@ -44,13 +43,9 @@ def first_values(graph: Any, start: Poses) -> Any:
     return values
 
 
-def optimise(graph: Any, values: Any, tolerance: float = 1e-5) -> Any:
-    """The values at which a graph's error is least (Levenberg & Marquardt).
-
-    tolerance : relative decrease of the error below which the iterations end.
-    """
+def optimise(graph: Any, values: Any) -> Any:
+    """The values at which a graph's error is least (Levenberg & Marquardt)."""
     p = gtsam.LevenbergMarquardtParams()
-    p.setRelativeErrorTol(tolerance)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, p).optimize()
 
 
@@ -107,8 +102,29 @@ def _noise(rotation: Array | float, R_local_camera: Array, horizontal_m: float, 
     """Noise of a pose: covariance (3, 3) or sigma of its rotation, sigmas of its position along the local axes."""
     R = R_local_camera
     position = R.T @ np.diag([horizontal_m, horizontal_m, vertical_m]) ** 2 @ R
-    turn = rotation if isinstance(rotation, np.ndarray) else np.eye(3) * rotation**2
-    return gaussian(np.asarray(block_diag(turn, position)))
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = rotation if isinstance(rotation, np.ndarray) else np.eye(3) * rotation**2
+    covariance[3:, 3:] = position
+    return gaussian(covariance)
+
+
+def plane_rows(R: Array, X_camera: Array, normal: Array) -> Array:
+    """By how much points of cameras move along normals when the cameras move: (K, 6), rotation and position, right.
+
+    R : (K, 3, 3) R_local_camera. X_camera : (K, 3). normal : (K, 3) local axes.
+    """
+    seen = np.einsum("kji,kj->ki", R, normal)
+    return np.column_stack([np.cross(X_camera, seen), seen])
+
+
+def linear(values: Any, blocks: dict[int, Array], b: Array) -> Any:
+    """Factor of whitened linear observations: the sum of blocks (K, dim) times the steps of the keys from values is b.
+
+    The values are where the observations were made linear.
+    """
+    (i, A_i), (j, A_j) = blocks.items()
+    noise = gtsam.noiseModel.Unit.Create(len(b))
+    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(i, A_i, j, A_j, b, noise), values)
 
 
 def robust(noise: Any, threshold: float) -> Any:

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.parameters import FeatureParameters
+from . import interest
 
-_CELLS_PER_SIDE = 8
+_SMALLEST_TILE_PX = 100.0
 
 
 class Features(NamedTuple):
@@ -24,59 +25,100 @@ class Features(NamedTuple):
     descriptors: NDArray[np.uint8]
 
 
-def detect(grey: NDArray[np.uint8], ignore: NDArray[np.bool_], parameters: FeatureParameters) -> Features:
-    """SIFT features of a grey image (H, W), none of them on pixels to ignore (H, W), such as the laser.
+def detect(
+    grey: NDArray[np.uint8],
+    ignore: NDArray[np.bool_],
+    parameters: FeatureParameters,
+    north_rad: float | None = None,
+) -> Features:
+    """SIFT descriptors at interest points of a grey image (H, W), none on pixels to ignore (H, W), such as the laser.
 
     Images with more than `max_pixels` are scaled down to that; the strongest features are kept evenly over the
     image, so that a bright corner does not take them all. They come strongest first.
+
+    north_rad : direction of north in the image, from u towards v. All descriptors are taken along it, which tells
+        features apart better than the direction of the gradient around each, and is as good in every image that a
+        compass was near. None: along the gradients, for images whose headings are not known.
     """
     height, width = grey.shape
     scale = min(1.0, (parameters.max_pixels / grey.size) ** 0.5)
     if scale < 1:
         size = round(width * scale), round(height * scale)
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    mask = cv2.resize((~ignore).astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    # without precise upscaling all features lie a quarter of a pixel off, which bends surveys with opposite headings
-    sift = cv2.SIFT_create(contrastThreshold=parameters.contrast_threshold, enable_precise_upscale=True)
-    found = sift.detect(grey, mask)
-    if not found:
+    mask = cv2.resize(ignore.astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
+    threshold = parameters.contrast_threshold * 255 / interest.LAYERS
+    found = interest.find(grey, mask, threshold, parameters.max_features, north_rad is None)
+    if not len(found.uv):
         return Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))
-    places, response = np.array([k.pt for k in found], np.float32), np.array([k.response for k in found])
-    # descriptors cost most: only of those that are kept
-    keep = _strongest_everywhere(places, response, grey.shape, parameters.max_features)
-    keypoints, descriptors = sift.compute(grey, [found[k] for k in keep])
-    uv = np.array([k.pt for k in keypoints], np.float32)
     # pixel centres at integers: it is the corners of the images that coincide
-    full = (uv + 0.5) * [width / grey.shape[1], height / grey.shape[0]] - 0.5
-    return Features(full.astype(np.float32), descriptors.astype(np.uint8))
+    full = (found.uv + 0.5) * [width / grey.shape[1], height / grey.shape[0]] - 0.5
+    return Features(full.astype(np.float32), _describe(grey, found, north_rad))
 
 
-def _strongest_everywhere(uv: NDArray, response: NDArray, shape: tuple[int, ...], count: int) -> NDArray[np.intp]:
-    """Indices of at most `count` features: by rank of their response within their cell of the image."""
-    column = np.minimum(uv[:, 0] * _CELLS_PER_SIDE / shape[1], _CELLS_PER_SIDE - 1).astype(int)
-    row = np.minimum(uv[:, 1] * _CELLS_PER_SIDE / shape[0], _CELLS_PER_SIDE - 1).astype(int)
-    cell = row * _CELLS_PER_SIDE + column
-    order = np.lexsort((-response, cell))
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(cell[order])) + 1])
-    rank = np.arange(len(uv)) - np.repeat(starts, np.diff([*starts, len(uv)]))
-    return order[np.argsort(rank, kind="stable")[:count]]
+def _describe(grey: NDArray[np.uint8], found: interest.Points, north_rad: float | None) -> NDArray[np.uint8]:
+    direction = found.gradient_rad if north_rad is None else np.full(len(found.uv), north_rad)
+    columns = (
+        *found.uv.T,
+        2 * found.sigma_px,
+        np.degrees(direction) % 360,
+        found.response,
+        found.octave | np.minimum(found.layer, interest.LAYERS) << 8,  # as OpenCV packs them
+    )
+    keypoints = [cv2.KeyPoint(*one) for one in zip(*(c.tolist() for c in columns), strict=True)]
+    sift = cv2.SIFT_create(nOctaveLayers=interest.LAYERS, sigma=interest.FIRST_SIGMA_PX)
+    return sift.compute(grey, keypoints)[1].astype(np.uint8)
 
 
-def match(descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8], ratio: float) -> NDArray[np.intp]:
-    """Mutual nearest neighbours (M, 2) that pass Lowe's ratio test, by the Hellinger distance (RootSIFT)."""
-    if len(descriptors_a) < 2 or len(descriptors_b) < 2:
+def half_turned(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The descriptors (N, 128) that the image would have the other way round: 4 by 4 cells of 8 directions."""
+    cells = descriptors.reshape(-1, 4, 4, 8)[:, ::-1, ::-1]
+    return np.roll(cells, 4, axis=3).reshape(-1, 128)
+
+
+class Expected(NamedTuple):
+    """Where navigation expects the features of image a in image b: (N, 2) pixels, and how far off they may be."""
+
+    uv: NDArray[np.floating]
+    reach_px: float
+
+
+def match(a: Features, b: Features, ratio: float, expected: Expected | None = None) -> NDArray[np.intp]:
+    """Mutual nearest neighbours (M, 2) that pass Lowe's ratio test, by the Hellinger distance (RootSIFT).
+
+    expected : of features of image b that are farther off, none is asked.
+    """
+    if len(a.uv) < 2 or len(b.uv) < 2:
         return np.zeros((0, 2), np.intp)
-    a, b = unit_root(descriptors_a), unit_root(descriptors_b)
-    similarity = a @ b.T
-    rows = np.arange(len(a))
-    best = similarity.argmax(1)
-    first = similarity[rows, best]
-    similarity[rows, best] = -1
+    root_a, root_b = unit_root(a.descriptors), unit_root(b.descriptors)
+    best, first = np.zeros(len(root_a), np.intp), np.full(len(root_a), -1.0, np.float32)
+    second, of_b = first.copy(), np.full(len(root_b), -1.0, np.float32)
+    for rows, columns in _tiles(len(root_a), b.uv, expected):
+        similarity = root_a[rows] @ root_b[columns].T
+        of_b[columns] = np.maximum(of_b[columns], similarity.max(0))
+        chosen, each = similarity.argmax(1), np.arange(len(rows))
+        best[rows], first[rows] = columns[chosen], similarity[each, chosen]
+        similarity[each, chosen] = -1
+        second[rows] = similarity.max(1)
     # |a - b|^2 = 2 - 2 a.b for unit vectors
-    distinct = np.flatnonzero((1 - first) < ratio**2 * (1 - similarity.max(1)))
-    back = (b[best[distinct]] @ a.T).argmax(1)  # of the few that are left: looking down columns is slow
-    keep = distinct[back == distinct]
+    keep = np.flatnonzero((1 - first < ratio**2 * (1 - second)) & (first >= of_b[best]) & (first > 0))
     return np.column_stack([keep, best[keep]])
+
+
+def _tiles(
+    count: int, uv_b: NDArray[np.float32], expected: Expected | None
+) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Features of image a, each once, with those of image b that may match them: two at least."""
+    if expected is None:
+        return [(np.arange(count), np.arange(len(uv_b)))]
+    side = max(expected.reach_px, _SMALLEST_TILE_PX)
+    tile = np.floor(expected.uv / side).astype(int)
+    found = []
+    for place in np.unique(tile, axis=0):
+        low = place * side - expected.reach_px
+        near = (uv_b >= low).all(1) & (uv_b <= low + side + 2 * expected.reach_px).all(1)
+        if near.sum() >= 2:
+            found.append((np.flatnonzero((tile == place).all(1)), np.flatnonzero(near)))
+    return found
 
 
 def unit_root(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -25,6 +25,7 @@ class Cells(NamedTuple):
     ----------
     elevation : m, weighted mean of the accepted soundings; NaN where there are none.
     sigma : m, 1-sigma of elevation; NaN where there are none.
+    noise : m, 1-sigma of that part of elevation's error that neighbouring cells do not share.
     density : number of accepted soundings.
     source : uint8, 0 none, 1 laser, 2 image matching.
     x, y : map position to which elevation belongs, the weighted mean of the soundings' positions, m; NaN where none.
@@ -32,6 +33,7 @@ class Cells(NamedTuple):
 
     elevation: Array
     sigma: Array
+    noise: Array
     density: NDArray[np.int32]
     source: NDArray[np.uint8]
     x: Array
@@ -157,16 +159,15 @@ def _means(grid: Grid, placed: _Sorted) -> Cells:
     density = np.bincount(placed.cell, minlength=count).astype(np.int32)
     source = np.zeros(count, np.uint8)
     source[placed.cell] = placed.soundings.source
-    position, sigma = np.full((count, 3), np.nan), np.full(count, np.nan)
+    values = np.full((count, 5), np.nan)
     if len(placed.cell):
-        cells = np.flatnonzero(density)
-        position[cells], sigma[cells] = _two_step_mean(placed)
-    x, y, z = (column.reshape(grid.shape) for column in position.T)
-    return Cells(z, sigma.reshape(grid.shape), density.reshape(grid.shape), source.reshape(grid.shape), x, y)
+        values[np.flatnonzero(density)] = _two_step_mean(placed)
+    x, y, z, sigma, noise = (column.reshape(grid.shape) for column in values.T)
+    return Cells(z, sigma, noise, density.reshape(grid.shape), source.reshape(grid.shape), x, y)
 
 
-def _two_step_mean(placed: _Sorted) -> tuple[Array, Array]:
-    """Mean positions (G, 3) of the G cells and sigma (G,) of their elevations."""
+def _two_step_mean(placed: _Sorted) -> Array:
+    """Mean positions of the G cells, sigma and noise of their elevations, (G, 5)."""
     soundings, of_cell = placed.soundings, group_index(placed.cell)
     changes = (np.diff(of_cell) > 0) | (np.diff(soundings.frame) != 0)
     of_frame = np.concatenate([[0], np.cumsum(changes)])
@@ -179,8 +180,10 @@ def _two_step_mean(placed: _Sorted) -> tuple[Array, Array]:
     # soundings of one frame share its pose; the largest of their pose sigmas stands for all
     pose = np.maximum.reduceat(soundings.pose_sigma, first)
     weight = 1 / (variance + pose**2)
+    own = np.bincount(frame_cell, weight**2 * variance) / np.bincount(frame_cell, weight) ** 2
     mean, variance = _weighted_mean(frame_cell, X, weight)
-    return mean, np.sqrt(variance * _birge(frame_cell, X[:, 2], mean[:, 2], weight))
+    scatter = _birge(frame_cell, X[:, 2], mean[:, 2], weight)
+    return np.column_stack([mean, np.sqrt(variance * scatter), np.sqrt(own * scatter)])
 
 
 def _weighted_mean(group: Indices, X: Array, weight: Array) -> tuple[Array, Array]:

@@ -33,13 +33,18 @@ class Ranges(NamedTuple):
     Attributes
     ----------
     image, track : (K,) camera and tie point. range_m : (K,) between them.
-    away_m : (K,) from the tie point to the nearest sounding.
+    away_m : (K,) from the tie point to the nearest sounding. slope : (K, 2) of the seabed there, east and north.
     """
 
     image: Indices
     track: Indices
     range_m: Array
     away_m: Array
+    slope: Array
+
+    def take(self, keep: NDArray[Any]) -> "Ranges":
+        """Those that a mask or an index array selects."""
+        return Ranges(*(column[keep] for column in self))
 
 
 def slopes(X: Array) -> Array:
@@ -61,13 +66,13 @@ def measure(poses: Poses, X: Array, soundings: Mapping[int, Array], most: int) -
 
     most : ranges of an image; those to the tie points nearest to its soundings are taken.
     """
-    found = [(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0), np.zeros(0))]
+    found = [(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0), np.zeros(0), np.zeros((0, 2)))]
     if len(X):
         tree, slope = KDTree(X[:, :2]), slopes(X)
         for k, own in soundings.items():
             if len(own) and np.isfinite(poses.C_local[k]).all():
                 track, range_m, away_m = _of_image(poses, k, own, X, slope, tree, most)
-                found.append((np.full(len(track), k, np.intp), track, range_m, away_m))
+                found.append((np.full(len(track), k, np.intp), track, range_m, away_m, slope[track]))
     return Ranges(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 

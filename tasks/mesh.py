@@ -1,122 +1,179 @@
-"""Triangle mesh of the bathymetry, simplified, with its place in the mosaic's texture."""
+"""Triangle meshes of square tiles of bathymetry, finer where the ground is less even, at several levels of detail.
 
-from typing import Final, NamedTuple
+A tile has SIDE + 1 nodes a side; at level 0 they are the centres of cells, at level n every 2^n-th of them, counted
+from the map's origin. Neighbouring tiles have the nodes of their common edge in common, and all of these are vertices
+of both, so tiles of a level fit on each other without cracks. Within a tile triangles are right and isosceles, halved
+where the ground departs from them (right-triangulated irregular network, Evans, Kirkpatrick & Townsend 2001).
+"""
+
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .grids import Bounds, Grid, cell_centres
-from .open3d_loader import load_open3d
+from .grids import Grid
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
+Array32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Nodes = NDArray[np.int32]
 
-_RAW_PER_KEPT: Final = 4  # triangles that simplification may choose from
-_RIM_WEIGHT: Final = 1.0
+SIDE: Final = 256  # steps between nodes along a tile's side
 
 
-class Mesh(NamedTuple):
-    """Triangles that face up.
+class Surface(NamedTuple):
+    """Triangles of a tile, anticlockwise seen from above.
 
     Attributes
     ----------
-    vertices : (V, 3) m, map coordinates less the local origin.
-    triangles : (T, 3) int32 vertices, anticlockwise seen from above.
-    uv : (V, 2) place in the texture, u from its west edge and v from its SOUTH edge, 0 to 1.
+    nodes : (V, 2) column and row of each vertex in the tile.
+    z : (V,) m.
+    triangles : (T, 3) vertices.
+    error_m : most that a node with data is away from the triangles.
     """
 
-    vertices: Array
-    triangles: NDArray[np.int32]
-    uv: Array
+    nodes: Nodes
+    z: Array32
+    triangles: Nodes
+    error_m: float
 
 
-def surface_mesh(
-    elevation: NDArray[np.floating], grid: Grid, origin_map: Array, texture: Bounds, max_triangles: int
-) -> Mesh:
-    """Mesh of a bathymetry, cut where there is no data.
+def leaf_grid(column: int, row: int, cell_m: float) -> Grid:
+    """The grid whose cells' centres are the nodes of a tile of level 0; rows of tiles count to the SOUTH."""
+    return Grid(cell_m, column * SIDE, -row * SIDE, SIDE + 1, SIDE + 1)
 
-    Parameters
-    ----------
-    elevation : (height, width) m, NaN for none.
-    grid : its grid.
-    origin_map : (3,) local origin in map coordinates, m.
-    texture : edges of the mosaic that is the texture.
-    max_triangles : quadric simplification (Garland & Heckbert 1997) ends at this many.
 
-    Raises
-    ------
-    ValueError
-        No three neighbouring cells have data.
+def simplified(z: Array, tolerance_m: float) -> Surface:
+    """Triangles of heights (SIDE + 1, SIDE + 1), row 0 north, NaN for none: cut where there is no data.
+
+    Where triangles are halved no further, the ground is within about the tolerance of them; along the tile's rim and
+    around cells without data they are as small as they can be.
     """
-    elevation, grid = _thinned(elevation, grid, max_triangles)
-    triangles = _cut_triangles(elevation)
-    if not len(triangles):
-        raise ValueError("the bathymetry has no three neighbouring cells with data: there is no surface to mesh")
-    used, triangles = np.unique(triangles, return_inverse=True)
-    X, Y = cell_centres(grid)
-    vertices = np.column_stack([X.ravel()[used], Y.ravel()[used], elevation.ravel()[used]]) - origin_map
-    triangles = triangles.reshape(-1, 3).astype(np.int32)
-    if len(triangles) > max_triangles:
-        vertices, triangles = _simplified(vertices, triangles, max_triangles)
-    place = vertices[:, :2] + origin_map[:2]
-    size = texture.east - texture.west, texture.north - texture.south
-    return Mesh(vertices, triangles, (place - [texture.west, texture.south]) / size)
+    departs = _departures(z)
+    corners = _halved(departs > tolerance_m)
+    known = np.isfinite(z)
+    corners = corners[known[corners[..., 1], corners[..., 0]].all(1)]
+    flat, triangles = np.unique(corners[..., 1] * (SIDE + 1) + corners[..., 0], return_inverse=True)
+    nodes = np.column_stack([flat % (SIDE + 1), flat // (SIDE + 1)]).astype(np.int32)
+    off = np.abs(_as_meshed(z, departs > tolerance_m) - z)
+    error = float(np.nanmax(off)) if np.isfinite(off).any() else 0.0
+    return Surface(nodes, z.ravel()[flat].astype(np.float32), triangles.reshape(-1, 3).astype(np.int32), error)
 
 
-def _thinned(elevation: NDArray[np.floating], grid: Grid, max_triangles: int) -> tuple[Array, Grid]:
-    """Means of squares of cells, so large that simplification has not much more than it needs."""
-    side = int(np.ceil(np.sqrt(2 * np.isfinite(elevation).sum() / (_RAW_PER_KEPT * max_triangles))))
-    if side <= 1:
-        return elevation.astype(float), grid
-    # squares are counted from the map's origin, as cells are
-    left, top = grid.left // side, -(-grid.top // side)
-    right, bottom = -(-(grid.left + grid.width) // side), (grid.top - grid.height) // side
-    coarse = Grid(grid.cell_m * side, left, top, right - left, top - bottom)
-    whole = np.full((coarse.height * side, coarse.width * side), np.nan)
-    row, column = top * side - grid.top, grid.left - left * side
-    whole[row : row + grid.height, column : column + grid.width] = elevation
-    squares = whole.reshape(coarse.height, side, coarse.width, side)
-    known = np.isfinite(squares).sum((1, 3))
-    mean = np.nansum(squares, axis=(1, 3)) / np.maximum(known, 1)
-    return np.where(2 * known >= side * side, mean, np.nan), coarse
+def _midpoints(step: int) -> list[tuple[Any, Any, Any]]:
+    """Where triangles of a size are halved: slices of the midpoints of their long sides, and of these sides' ends.
 
-
-def _cut_triangles(elevation: Array) -> Indices:
-    """Two triangles between four neighbouring cells with data, one between three; (T, 3) flat cells.
-
-    A square is cut along the diagonal with the smaller step, which follows edges of the ground.
+    First long sides along rows and columns, 2 * step long, then diagonals of squares of 2 * step, every other one the
+    other way.
     """
-    flat = np.arange(elevation.size).reshape(elevation.shape)
-    corners = np.stack([flat[:-1, :-1], flat[:-1, 1:], flat[1:, 1:], flat[1:, :-1]], -1).reshape(-1, 4)
-    z = elevation.ravel()[corners]  # clockwise from the north-west
-    missing = np.isnan(z)
-    falling = np.abs(z[:, 0] - z[:, 2]) <= np.abs(z[:, 1] - z[:, 3])
-    full, three = ~missing.any(1), missing.sum(1) == 1
-    found = [
-        corners[full & falling][:, order] if way else corners[full & ~falling][:, order]
-        for way, order in ((True, [0, 3, 2]), (True, [0, 2, 1]), (False, [0, 3, 1]), (False, [1, 3, 2]))
+    odd, even, ends = slice(step, None, 2 * step), slice(None, None, 2 * step), slice(2 * step, None, 2 * step)
+    starts = slice(None, -1, 2 * step)
+    return [
+        ((even, odd), (even, starts), (even, ends)),
+        ((odd, even), (starts, even), (ends, even)),
+        ((odd, odd), (starts, starts), (ends, ends)),
+        ((odd, odd), (starts, ends), (ends, starts)),
     ]
-    for lost in range(4):
-        order = [(lost + 3) % 4, (lost + 2) % 4, (lost + 1) % 4]
-        found.append(corners[three & missing[:, lost]][:, order])
-    return np.concatenate(found)
 
 
-def _simplified(vertices: Array, triangles: NDArray[np.int32], max_triangles: int) -> tuple[Array, NDArray[np.int32]]:
-    open3d = load_open3d()
-    mesh = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(triangles)
-    )
-    mesh = mesh.simplify_quadric_decimation(max_triangles, boundary_weight=_RIM_WEIGHT)
-    mesh.remove_degenerate_triangles()
-    vertices, triangles = np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int32)
-    upright = triangles[_area_above(vertices, triangles) > 0]
-    used, renumbered = np.unique(upright, return_inverse=True)
-    return vertices[used], renumbered.reshape(-1, 3).astype(np.int32)
+def _other_way(count: int) -> Mask:
+    """Of the squares (count, count) of a size, those whose diagonal runs from north-east to south-west."""
+    return (np.arange(count)[:, None] + np.arange(count)) % 2 == 1
 
 
-def _area_above(vertices: Array, triangles: NDArray[np.int32]) -> Array:
-    """Area (T,) seen from above, m2; negative for a triangle that faces down."""
-    a, b, c = (vertices[triangles[:, k], :2] for k in range(3))
-    first, second = b - a, c - a
-    return 0.5 * (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+def _departures(z: Array) -> Array:
+    """How far the ground departs at each node from the long side that it is the middle of, or at those below it."""
+    found = np.zeros(z.shape)
+    step = 1
+    while step < SIDE:
+        across, down, falling, rising = _midpoints(step)
+        for middle, start, end in (across, down):
+            found[middle] = np.maximum(_departure(z, middle, start, end), _below(found, middle, step))
+        # tiles meet at their rims, where nothing is left out
+        for rim in (found[0], found[-1], found[:, 0], found[:, -1]):
+            rim[step :: 2 * step] = np.inf
+        own = np.where(_other_way(SIDE // (2 * step)), _departure(z, *rising), _departure(z, *falling))
+        (rows, columns), _, _ = falling
+        sides = [found[rows, slice(k, None, 2 * step)][:, : own.shape[1]] for k in (0, 2 * step)]
+        sides += [found[slice(k, None, 2 * step), columns][: own.shape[0]] for k in (0, 2 * step)]
+        found[rows, columns] = np.maximum.reduce([own, *sides])
+        step *= 2
+    return found
+
+
+def _departure(z: Array, middle: Any, start: Any, end: Any) -> Array:
+    """How far midpoints are from the mean of the ends; infinite where only some of the three have data."""
+    known = np.isfinite(z)
+    count = known[middle].astype(int) + known[start] + known[end]
+    return np.where(count == 3, np.abs(z[middle] - (z[start] + z[end]) / 2), np.where(count == 0, 0.0, np.inf))
+
+
+def _below(found: Array, middle: Any, step: int) -> Array | float:
+    """The largest departure in the middles of the four squares around midpoints along rows or columns."""
+    half = step // 2
+    if not half:
+        return 0.0
+    wide = np.pad(found, half)
+    rows, columns = np.arange(len(found))[middle[0]], np.arange(len(found))[middle[1]]
+    around = [wide[np.ix_(rows + i, columns + j)] for i in (0, 2 * half) for j in (0, 2 * half)]
+    return np.maximum.reduce(around)
+
+
+def _halved(split: Mask) -> NDArray[np.int64]:
+    """Corners (T, 3, 2) as column and row of the triangles that are left when those with split midpoints are halved."""
+    far = SIDE
+    waiting = np.array([[[0, 0], [far, far], [far, 0]], [[far, far], [0, 0], [0, far]]])
+    done = []
+    while len(waiting):
+        a, b, c = waiting.transpose(1, 0, 2)
+        middle = (a + b) // 2
+        halve = (np.abs(a - c).sum(1) > 1) & split[middle[:, 1], middle[:, 0]]
+        done.append(waiting[~halve])
+        a, b, c, middle = a[halve], b[halve], c[halve], middle[halve]
+        waiting = np.concatenate([np.stack([c, a, middle], 1), np.stack([b, c, middle], 1)])
+    corners = np.concatenate(done)
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    clockwise = first[:, 0] * -second[:, 1] + first[:, 1] * second[:, 0] < 0  # rows count southwards
+    corners[clockwise] = corners[clockwise][:, [0, 2, 1]]
+    return corners
+
+
+def _as_meshed(z: Array, split: Mask) -> Array:
+    """Heights of the mesh at all nodes."""
+    found, step = z.copy(), SIDE // 2
+    while step:
+        across, down, falling, rising = _midpoints(step)
+        (middle, *_), other = falling, _other_way(SIDE // (2 * step))
+        mean = np.where(other, _mean(found, rising), _mean(found, falling))
+        found[middle] = np.where(split[middle], z[middle], mean)
+        for side in (across, down):
+            found[side[0]] = np.where(split[side[0]], z[side[0]], _mean(found, side))
+        step //= 2
+    return found
+
+
+def _mean(z: Array, side: tuple[Any, Any, Any]) -> Array:
+    return (z[side[1]] + z[side[2]]) / 2
+
+
+def halved_resolution(quarters: dict[tuple[int, int], Array]) -> Array:
+    """Heights (SIDE + 1, SIDE + 1) of a tile from those of the four of the level below, by (right, down) of 0 and 1."""
+    whole = np.full((2 * SIDE + 1, 2 * SIDE + 1), np.nan)
+    for (right, down), z in quarters.items():
+        part = whole[down * SIDE : (down + 1) * SIDE + 1, right * SIDE : (right + 1) * SIDE + 1]
+        part[:] = np.where(np.isnan(part), z, part)
+    return whole[::2, ::2]
+
+
+def lost_detail(quarters: dict[tuple[int, int], Array], z: Array) -> float:
+    """The most that nodes of the tiles below, by (right, down), are away from z of the tile above and between."""
+    half, lost = SIDE // 2, 0.0
+    for (right, down), fine in quarters.items():
+        coarse = z[down * half : (down + 1) * half + 1, right * half : (right + 1) * half + 1]
+        rows = np.repeat(coarse, 2, 0)[:-1].astype(float)
+        rows[1::2] = (coarse[:-1] + coarse[1:]) / 2
+        whole = np.repeat(rows, 2, 1)[:, :-1]
+        whole[:, 1::2] = (rows[:, :-1] + rows[:, 1:]) / 2
+        off = np.abs(whole - fine)
+        lost = max(lost, float(np.nanmax(off)) if np.isfinite(off).any() else 0.0)
+    return lost

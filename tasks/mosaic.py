@@ -86,12 +86,17 @@ class Laid(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A tile before its colours: source (rows, columns of its blocks) int32 is -1 where nothing is seen."""
+    """A tile before its colours.
+
+    source (rows, columns of its blocks) int32 is -1 where nothing is seen; painted where only laser light shows the
+    place.
+    """
 
     tile: Grid
     place: Ground
     laid: tuple[Laid, ...]
     source: NDArray[np.int32]
+    painted: Mask
 
 
 class Mosaic(NamedTuple):
@@ -102,11 +107,14 @@ class Mosaic(NamedTuple):
     rgb : (3, height, width) uint8, 0 where nothing was seen.
     mask : (height, width) whether anything was seen.
     source : (height, width) int32, number of the image behind most of each cell, -1 none.
+    painted : (height, width) whether the laser lights the cell in every image that sees it, so that its colours are
+        those around it.
     """
 
     rgb: Pixels
     mask: Mask
     source: NDArray[np.int32]
+    painted: Mask
 
 
 def plan(
@@ -124,17 +132,17 @@ def plan(
     found = [(shot, see(place, shot, lie, feather_m)) for shot, lie in shots]
     views = [(shot, seen) for shot, seen in found if seen is not None]
     best = _upper_bound(place, views, feather_m)
-    source = np.full(place.blocks.shape, -1, np.int32)
+    source, painted = np.full(place.blocks.shape, -1, np.int32), np.zeros(place.blocks.shape, bool)
     patches: list[list[Patch]] = [[] for _ in views]
     reach = _REACH_FEATHERS * feather_m + place.nodes.cell_m
     for (row, column), rivals in sorted(_rivals(place, views, best, reach).items()):
         at = slice(row * BLOCK, (row + 1) * BLOCK), slice(column * BLOCK, (column + 1) * BLOCK)
-        source[at] = _share_out(place, views, rivals, (row, column), feather_m, patches)
+        source[at], painted[at] = _share_out(place, views, rivals, (row, column), feather_m, patches)
     tones = _tones(place, views, patches, best, tone, feather_m)
     laid = [
         Laid(shot, seen, parts, *both) for (shot, seen), parts, both in zip(views, patches, tones, strict=True) if parts
     ]
-    return Plan(tile, place, tuple(laid), source)
+    return Plan(tile, place, tuple(laid), source, painted)
 
 
 def _part(place: Ground, seen: Seen) -> tuple[slice, slice]:
@@ -192,11 +200,11 @@ def _share_out(
     block: tuple[int, int],
     feather_m: float,
     patches: list[list[Patch]],
-) -> NDArray[np.int32] | int:
-    """Weights of the images in a block, added to their patches; the number of the image behind each pixel."""
+) -> tuple[NDArray[np.int32] | int, Mask | bool]:
+    """Weights of the images in a block, added to their patches; of each pixel the image and whether it is painted."""
     if len(rivals) == 1 and _clean(place, views[rivals[0]][1], block):
         patches[rivals[0]].append(Patch(*block, None, False))
-        return views[rivals[0]][0].number
+        return views[rivals[0]][0].number, False
     costs = [_pixel_cost(place, *views[k], block, feather_m) for k in rivals]
     lowest, first = _lowest(costs)
     seen_at_all = np.isfinite(lowest)
@@ -210,7 +218,8 @@ def _share_out(
             painted = bool(((cost >= ERASED_M) & (share > 0)).any())
             patches[k].append(Patch(*block, share.astype(np.uint8), painted))
     numbers = np.array([views[k][0].number for k in rivals], np.int32)
-    return np.where(seen_at_all, numbers[first], np.int32(-1))
+    lit = _lit(place, [views[k] for k in rivals], block, first) if (lowest >= ERASED_M).any() else False
+    return np.where(seen_at_all, numbers[first], np.int32(-1)), lit & seen_at_all
 
 
 def _lowest(costs: Sequence[Array32]) -> tuple[Array32, NDArray[np.uint16]]:
@@ -232,11 +241,27 @@ def _pixel_cost(place: Ground, shot: Shot, seen: Seen, block: tuple[int, int], f
     at = _block_nodes(place, seen, *block)
     cost = upsample(seen.cost[at], place.step)
     if not (seen.quality[at] == BEST).all():
-        scale = quality_scale(shot.camera)
-        u, v = (upsample((w[at] + np.float32(0.5)) / scale - np.float32(0.5), place.step) for w in (seen.u, seen.v))
-        quality = cv2.remap(shot.quality, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[OUTSIDE])
-        cost = cost + quality_cost(np.asarray(quality, np.uint8), feather_m)
+        cost = cost + quality_cost(_pixel_quality(place, shot, seen, block, shot.quality), feather_m)
     return np.where(np.isfinite(cost), cost, np.float32(np.inf))
+
+
+def _pixel_quality(
+    place: Ground, shot: Shot, seen: Seen, block: tuple[int, int], quality: Pixels, beyond: int = OUTSIDE
+) -> Pixels:
+    """Of an image of qualities, or one like it, the values (128, 128) in a block."""
+    at, scale = _block_nodes(place, seen, *block), quality_scale(shot.camera)
+    u, v = (upsample((w[at] + np.float32(0.5)) / scale - np.float32(0.5), place.step) for w in (seen.u, seen.v))
+    found = cv2.remap(quality, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[beyond])
+    return np.asarray(found, np.uint8)
+
+
+def _lit(place: Ground, views: Sequence[tuple[Shot, Seen]], block: tuple[int, int], first: NDArray[np.uint16]) -> Mask:
+    """Pixels of a block that the laser lights in the image, by its place in views, that is shown there."""
+    lit = np.zeros(first.shape, bool)
+    for k, (shot, seen) in enumerate(views):
+        erased = np.where(shot.quality == ERASED, np.uint8(255), np.uint8(0))
+        lit |= (first == k) & (_pixel_quality(place, shot, seen, block, erased, 0) > 0)
+    return lit
 
 
 def _tones(
@@ -358,7 +383,7 @@ def _finish(made: Plan, total: Array32, gamma: float) -> Mosaic:
         rgb[:, rows] = [
             levels.take(np.asarray(band, np.uint16), mode="wrap") for band in cv2.split(_as_16_bits(light[rows]))
         ]
-    return Mosaic(rgb, source >= 0, np.ascontiguousarray(source))
+    return Mosaic(rgb, source >= 0, np.ascontiguousarray(source), np.ascontiguousarray(made.painted[at]))
 
 
 def _as_16_bits(light: NDArray) -> NDArray[np.uint16]:

@@ -23,7 +23,10 @@ _SCALE_RADIUS = 0.03  # slope within which a sounding tells a feature's depth: 9
 _MIN_SCALE_FEATURES = 5
 _LASER_CONTRADICTS = 0.1  # spread of the depth ratios beyond which a motion is not the right one
 _UNIT_LENGTH_SIGMA = 1e-3
-_MAX_MATCHES = 500
+_MAX_MATCHES = 300
+_SMALL_STEP = 1e-7  # of rotation and translation, for derivatives
+_ENOUGH = 1e-4  # relative decrease of the squares that ends the search: a small part of a sigma
+_PLANE_POINTS = 500
 
 
 class Plane(NamedTuple):
@@ -61,6 +64,7 @@ def fit_plane(X: Array, tolerance_m: float, trials: int = 200) -> Plane | None:
     """Plane through points (N, 3) by RANSAC, refined on its inliers; the normal points away from the camera."""
     if len(X) < 10:
         return None
+    X = X[:: max(1, len(X) // _PLANE_POINTS)]
     rng = np.random.default_rng(0)
     corners = X[rng.integers(0, len(X), (trials, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -314,17 +318,25 @@ def _minimise_sampson(x_i: Array, x_j: Array, R: Array, t: Array, focal_px: floa
 
     p_i, p_j = _homogeneous(x_i), _homogeneous(x_j)
 
-    def residuals(step: Array) -> Array:
-        R_step, t_step = _moved(R, t, step)
-        rows = np.append(
-            _sampson(p_i, p_j, R_step, t_step) / sigma, np.log(np.linalg.norm(t_step)) / _UNIT_LENGTH_SIGMA
-        )
-        if prior is None or whiten is None:
-            return rows
-        off = _log(prior.R_i_j.T @ R_step, prior.R_i_j.T @ (t_step * length - prior.t_i_j))
-        return np.append(rows, whiten @ off)
+    def at(steps: Array) -> Array:
+        """Residuals (K, rows) after each of K steps."""
+        moved = [_moved(R, t, step) for step in steps]
+        rows = _sampson(p_i, p_j, np.stack([_essential(*one) for one in moved])) / sigma
+        other = [others(*one) for one in moved]
+        return np.column_stack([rows, np.array(other)])
 
-    return least_squares(residuals, np.zeros(6), loss="huber", f_scale=2.0)
+    def others(R_step: Array, t_step: Array) -> Array:
+        stretched = np.log(np.linalg.norm(t_step)) / _UNIT_LENGTH_SIGMA
+        if prior is None or whiten is None:
+            return np.array([stretched])
+        off = _log(prior.R_i_j.T @ R_step, prior.R_i_j.T @ (t_step * length - prior.t_i_j))
+        return np.append(stretched, whiten @ off)
+
+    def jacobian(step: Array) -> Array:
+        found = at(step + np.concatenate([np.zeros((1, 6)), _SMALL_STEP * np.eye(6)]))
+        return (found[1:] - found[0]).T / _SMALL_STEP
+
+    return least_squares(lambda step: at(step[None])[0], np.zeros(6), jacobian, loss="huber", f_scale=2.0, ftol=_ENOUGH)
 
 
 def _epipolar_covariance(solution: Any, scale_sigma: float, with_prior: bool) -> Array:
@@ -347,16 +359,21 @@ def _covariance(jacobian: Array, residual: Array) -> Array:
 
 def sampson(x_i: Array, x_j: Array, R_i_j: Array, t_i_j: Array) -> Array:
     """Signed Sampson distance (N,) in slopes of matches (N, 2) from the epipolar geometry of a motion."""
-    return _sampson(_homogeneous(x_i), _homogeneous(x_j), R_i_j, t_i_j)
+    return _sampson(_homogeneous(x_i), _homogeneous(x_j), _essential(R_i_j, t_i_j))
 
 
-def _sampson(p_i: Array, p_j: Array, R_i_j: Array, t_i_j: Array) -> Array:
+def _essential(R_i_j: Array, t_i_j: Array) -> Array:
+    """E (3, 3) with x_j' E x_i = 0."""
     t = t_i_j / np.linalg.norm(t_i_j)
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    E = (cross @ R_i_j).T  # x_j' E x_i = 0
-    line_j, line_i = p_i @ E.T, p_j @ E
-    norm = np.sqrt((line_j[:, :2] ** 2).sum(1) + (line_i[:, :2] ** 2).sum(1))
-    return np.einsum("ij,ij->i", p_j, line_j) / np.maximum(norm, 1e-12)
+    return (cross @ R_i_j).T
+
+
+def _sampson(p_i: Array, p_j: Array, E: Array) -> Array:
+    """Distances (..., N) for essential matrices (..., 3, 3)."""
+    line_j, line_i = p_i @ E.swapaxes(-1, -2), p_j @ E
+    norm = np.sqrt((line_j[..., :2] ** 2).sum(-1) + (line_i[..., :2] ** 2).sum(-1))
+    return (p_j * line_j).sum(-1) / np.maximum(norm, 1e-12)
 
 
 def depths(x_i: Array, x_j: Array, R_i_j: Array, t_i_j: Array) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from .rotations import R_LOCAL_LEVEL, R_level_vehicle, R_vehicle_camera
 Array = NDArray[Any]
 
 _JITTER = 0.1
+_STATED_S = 100.0  # the soonest in which dead reckoning goes wrong by its stated sigma
 
 
 class Poses(NamedTuple):
@@ -80,6 +81,11 @@ class NavigationPrior(NamedTuple):
     R_camera_vehicle: Array
 
 
+def north_rad(poses: Poses) -> Array:
+    """Direction (n,) of north in each image, from u towards v, radians."""
+    return np.arctan2(poses.R_local_camera[:, 1, 1], poses.R_local_camera[:, 1, 0])
+
+
 class RelativePrior(NamedTuple):
     """Navigation's motion between two images, as `motion.Motion` states it.
 
@@ -135,8 +141,10 @@ def walk_m(navigation: NavigationPrior, i: int, j: int) -> float:
     """1-sigma along either horizontal axis of navigation's step between two images, metres.
 
     Dead reckoning walks; each position jitters besides, by a share of its stated sigma, which is what a satellite or
-    acoustic fix does most. Never more than the stated sigmas say.
+    acoustic fix does most. Never more than the stated sigmas say, nor so fast that the walk has passed them within
+    a minute or two: a good navigation drifts less.
     """
     elapsed = abs(float(navigation.time_s[j] - navigation.time_s[i]))
-    stated = np.hypot(navigation.sigma_horizontal[i], navigation.sigma_horizontal[j])
-    return float(min(np.hypot(navigation.drift_m_per_sqrt_s * np.sqrt(elapsed), _JITTER * stated), stated))
+    sigmas = navigation.sigma_horizontal[[i, j]]
+    stated, drift = np.hypot(*sigmas), min(navigation.drift_m_per_sqrt_s, sigmas.max() / np.sqrt(_STATED_S))
+    return float(min(np.hypot(drift * np.sqrt(elapsed), _JITTER * stated), stated))

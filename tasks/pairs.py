@@ -94,16 +94,18 @@ def sequential(count: int, reach: int) -> Pairs:
     return Pairs(pairs.astype(np.intp), np.ones(len(pairs)))
 
 
-def seen_by(camera: Camera, uv: Array, poses: Poses, source: int, target: int, range_m: float, margin_m: float):
-    """Which pixels (N, 2) of image `source` image `target` may see too, (N,) bool.
+def expected(camera: Camera, uv: Array, poses: Poses, source: int, target: int, range_m: float) -> Array:
+    """Pixels (N, 2) at which image `target` sees what image `source` sees at pixels (N, 2).
 
-    By the poses known so far, on a level seabed range_m below the source, with margin_m for what they may be wrong.
+    By the poses known so far, on a level seabed range_m below the source.
     """
     direction = rays(camera, uv).direction @ poses.R_local_camera[source].T
     down = np.maximum(-direction[:, 2:], np.cos(np.radians(80)))
     ground = poses.C_local[source] + direction / down * range_m
-    X_target = (ground - poses.C_local[target]) @ poses.R_local_camera[target]
-    pixels = project(camera, X_target)
-    margin = margin_m / range_m * max(camera.fx, camera.fy)
+    return project(camera, (ground - poses.C_local[target]) @ poses.R_local_camera[target])
+
+
+def inside(camera: Camera, uv: Array, margin_px: float) -> NDArray[np.bool_]:
+    """Which pixels (N, 2) lie in the image, or not more than a margin beside it."""
     size = np.array([camera.width, camera.height])
-    return ((pixels > -margin) & (pixels < size + margin)).all(1)
+    return np.asarray(((uv > -margin_px) & (uv < size + margin_px)).all(1))

@@ -44,3 +44,10 @@ def nearest_rotation(M: Array) -> Array:
     """The rotation closest to a (3, 3) matrix in the Frobenius norm."""
     U, _, Vt = np.linalg.svd(M)
     return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+
+
+def quaternion_angle_deg(a_wxyz: Array, b_wxyz: Array) -> float:
+    """Angle between the rotations of two unit quaternions, w x y z."""
+    a, b = np.asarray(a_wxyz, float), np.asarray(b_wxyz, float)
+    near = b if a @ b >= 0 else -b
+    return float(np.degrees(4 * np.arctan2(np.linalg.norm(a - near), np.linalg.norm(a + near))))

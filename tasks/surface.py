@@ -9,6 +9,7 @@ twice that distance (`halo_cells`) gives each cell the same value in every tile.
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
@@ -25,7 +26,7 @@ _RIM_CELLS = 3  # any circle of this diameter, in cells, has a whole cell inside
 _JITTER_CELLS = 1e-4  # so that no four vertices lie on one circle, where the triangulation would be a toss-up
 _MIN_ERRORS = 30
 _FIT_ERRORS = 20_000
-_ONE_SIGMA = 0.6827
+_ONE_SIGMA, _TWO_SIGMA = 0.6827, 0.9545
 
 
 class Growth(NamedTuple):
@@ -207,6 +208,30 @@ def without_guesses(surface: Surface, max_sigma_m: float) -> Surface:
     return Surface(elevation, sigma, np.where(guess, 0, surface.source).astype(np.uint8))
 
 
+def seen(grid: Grid, outlines: Array) -> Mask:
+    """Which cells (height, width) lie within an image's outline, (K, M, 2) map metres."""
+    x, y = outlines[..., 0] / grid.cell_m - grid.left - 0.5, grid.top - outlines[..., 1] / grid.cell_m - 0.5
+    covered = np.zeros(grid.shape, np.uint8)
+    for points in np.round(np.stack([x, y], -1)).astype(np.int32):
+        cv2.fillConvexPoly(covered, cv2.convexHull(points), 1)
+    return covered > 0
+
+
+def worst_shown(sigma: Array, least_share: float, max_sigma_m: float) -> float:
+    """The sigma up to which interpolated cells are worth showing, m.
+
+    Parameters
+    ----------
+    sigma : (N,) of all cells that were seen; 0 where they were sounded, NaN where nothing reaches.
+    least_share : of them that are to have a value.
+    max_sigma_m : more is never shown.
+    """
+    if not len(sigma):
+        return max_sigma_m
+    worst = np.quantile(np.where(np.isfinite(sigma), sigma, np.inf), least_share, method="higher")
+    return float(min(worst, max_sigma_m))
+
+
 def growth_sigma(growth: Growth, distance_m: Array, spread_m: Array) -> Array:
     """Sigma (N,) of interpolation, m, at a distance from the nearest sounding and with a spread of the corners."""
     return np.hypot(growth.scale_m * distance_m**growth.exponent, growth.relief * spread_m)
@@ -268,8 +293,9 @@ def hold_out(grid: Grid, cells: Cells, max_distance_m: float) -> Holdout:
 def fit_growth(holdout: Holdout) -> Growth:
     """The growth under which 68 % of the errors are within one sigma, at every distance and relief.
 
-    Quantile regression (Koenker & Bassett 1978) of the error's size on `growth_sigma`. With fewer than 30 errors
-    the default stands.
+    Quantile regression (Koenker & Bassett 1978) of the error's size on `growth_sigma`. Where boulders make a longer
+    tail than a normal distribution has, sigma is widened halfway, on a scale of ratios, to what would hold 95 % within
+    two. With fewer than 30 errors the default stands.
     """
     if len(holdout.error_m) < _MIN_ERRORS:
         return Growth()
@@ -286,4 +312,7 @@ def fit_growth(holdout: Holdout) -> Growth:
 
     start = np.array([math.log(max(float(np.median(error)), 1e-6)), 0.4, math.log(0.3)])
     best = minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-9, "maxiter": 600})
-    return growth(best.x)
+    found = growth(best.x)
+    tail = float(np.quantile(error / growth_sigma(found, distance, spread), _TWO_SIGMA)) / 2
+    wider = math.sqrt(max(tail, 1.0))
+    return Growth(wider * found.scale_m, found.exponent, wider * found.relief)

@@ -1,6 +1,6 @@
 """The ground under a mosaic: its height at each cell and what it hides from a camera."""
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -35,16 +35,16 @@ class _Rays(NamedTuple):
 
     Attributes
     ----------
-    cell : flat index of the cell that it began in.
-    row, column : of that cell in the terrain's grid.
+    cell : which one it is: the flat index of the cell that it began in, or its number.
+    row, column : where it began in the terrain's grid.
     down, right : rows and columns gained by a step, which is as long as a cell.
     height, rise : m, above which ground hides the cell at the start, and what a step adds.
     steps : to the camera.
     """
 
     cell: NDArray[np.int64]
-    row: NDArray[np.int64]
-    column: NDArray[np.int64]
+    row: NDArray[Any]
+    column: NDArray[Any]
     down: Array
     right: Array
     height: Array
@@ -115,8 +115,35 @@ def hidden(terrain: Terrain, steepest: Array, cells: Grid, C_map: Array) -> Arra
     if not len(rays.cell):
         return np.zeros(cells.shape)
     found = np.where(np.isfinite(terrain.elevation[rows, columns]), 0.0, np.nan)
-    top = float(np.nanmax(terrain.elevation))
-    step = 0
+    found.reshape(-1)[_blocked(terrain, rays)] = 1.0
+    return np.nan_to_num(resample(found, grid, cells)) if (found == 1).any() else np.zeros(cells.shape)
+
+
+def points_hidden(terrain: Terrain, X_map: Array, C_map: Array) -> NDArray[np.bool_]:
+    """Which points (N, 3) on the ground the terrain hides from a camera at C_map (3,); see `hidden`."""
+    cell = terrain.grid.cell_m
+    east, north, above = (C_map - X_map).T
+    away = np.maximum(np.hypot(east, north), 1e-9)
+    x, y = axes(terrain.grid)
+    rays = _Rays(
+        np.arange(len(X_map)),
+        (y[0] - X_map[:, 1]) / cell,
+        (X_map[:, 0] - x[0]) / cell,
+        -north / away,
+        east / away,
+        X_map[:, 2] + cell,
+        cell * above / away,
+        away / cell,
+    )
+    found = np.zeros(len(X_map), bool)
+    found[_blocked(terrain, rays)] = True
+    return found
+
+
+def _blocked(terrain: Terrain, rays: _Rays) -> NDArray[np.int64]:
+    """The rays, by `cell`, that meet ground on their way."""
+    top = float(np.nanmax(terrain.elevation)) if np.isfinite(terrain.elevation).any() else -np.inf
+    found, step = [np.zeros(0, np.int64)], 0
     while len(rays.cell):
         step += 1
         height = rays.height + step * rays.rise
@@ -126,9 +153,9 @@ def hidden(terrain: Terrain, steepest: Array, cells: Grid, C_map: Array) -> Arra
         going &= (row >= 0) & (row < terrain.grid.height) & (column >= 0) & (column < terrain.grid.width)
         going = np.flatnonzero(going)
         blocked = terrain.elevation[row[going], column[going]] > height[going]
-        found.reshape(-1)[rays.cell[going[blocked]]] = 1.0
+        found.append(rays.cell[going[blocked]])
         rays = _Rays._make(values[going[~blocked]] for values in rays)
-    return np.nan_to_num(resample(found, grid, cells)) if (found == 1).any() else np.zeros(cells.shape)
+    return np.concatenate(found)
 
 
 def _rays(terrain: Terrain, steepest: Array, grid: Grid, C_map: Array) -> _Rays:

@@ -1,11 +1,15 @@
-"""A small mission that every test may spoil in its own way."""
+"""A small mission that every test may spoil in its own way, and an S3 server."""
 
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import s3fs
+
+from tests.fleet import S3, s3_server
 
 MISSION = """\
 format: 1
@@ -61,3 +65,15 @@ def tiny_mission(tmp_path: Path) -> Path:
         picture = rng.integers(0, 255, (48, 64, 3), np.uint8)
         assert cv2.imwrite(str(folder / "images" / name), picture)
     return folder
+
+
+@pytest.fixture(scope="session")
+def s3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[S3]:
+    """An S3 server with a bucket, to which the environment leads."""
+    with s3_server(tmp_path_factory.mktemp("s3")) as server, pytest.MonkeyPatch.context() as patch:
+        for name, value in server.env.items():
+            patch.setenv(name, value)
+        s3fs.S3FileSystem.clear_instance_cache()
+        s3fs.S3FileSystem().mkdir(server.bucket)
+        yield server
+        s3fs.S3FileSystem.clear_instance_cache()

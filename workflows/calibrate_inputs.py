@@ -25,6 +25,7 @@ from ..tasks.calibration_flat import FlatData, gather
 from ..tasks.calibration_lines import Lines, cross_on_flat, no_lines
 from ..tasks.rotations import R_vehicle_camera
 from . import match, plan
+from .extract import ImageTask
 from .job import Job, log
 from .progress import progress
 
@@ -291,10 +292,10 @@ def matches(survey: Survey, parameters: Parameters) -> Matches:
     number = {int(row): k for k, row in enumerate(survey.rows)}
     of_survey = made._replace(images=tuple(image for image in made.images if image.row in number))
     tasks = plan.first_pairs(of_survey, survey.opened, parameters)
-    needed = sorted({row for task in tasks for row in (task.i, task.j)})
-    entries = dict(
-        zip(needed, _each(survey, "features", lambda row: _entry(survey, row, parameters), needed), strict=True)
-    )
+    paired = {row for task in tasks for row in (task.i, task.j)}
+    needed = [image for image in of_survey.images if image.row in paired]
+    seen = _each(survey, "features", lambda image: _entry(survey, image, parameters), needed)
+    entries = {image.row: entry for image, entry in zip(needed, seen, strict=True)}
     found = _each(survey, "matches", lambda task: match.between(job, task, entries[task.i], entries[task.j]), tasks)
     linked = [(task, made_) for task, made_ in zip(tasks, found, strict=True) if made_.info["model"]]
     if not linked:
@@ -309,9 +310,9 @@ def matches(survey: Survey, parameters: Parameters) -> Matches:
     )
 
 
-def _entry(survey: Survey, row: int, parameters: Parameters) -> Entry:
+def _entry(survey: Survey, image: ImageTask, parameters: Parameters) -> Entry:
     """Features of an image, away from whatever looks like laser light."""
-    bgr = _read(survey, row)
+    bgr = _read(survey, image.row)
     info: dict[str, Any] = {"range_m": None, "status": ""}
     if bgr is None:
         return Entry({"feature_uv": np.zeros((0, 2)), "feature_descriptors": np.zeros((0, 128), np.uint8)}, info)
@@ -319,5 +320,5 @@ def _entry(survey: Survey, row: int, parameters: Parameters) -> Entry:
     width = float(np.median(points.width_px)) if len(points.uv) else 1.0
     erase = laser.mask(bgr.shape[:2], points.uv, 3.3 * width)
     grey = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-    found = features.detect(grey, erase, parameters.features)
+    found = features.detect(grey, erase, parameters.features, image.north_rad)
     return Entry({"feature_uv": found.uv, "feature_descriptors": found.descriptors}, info)

@@ -1,6 +1,11 @@
-"""The `seamosaic` command. Exit codes: 0 done, 1 failed, 2 invalid input."""
+"""The `seamosaic` command.
 
+Exit codes: 0 done, 1 failed (of an archive: any mission), 2 invalid input, 130 interrupted, 143 ended by SIGTERM.
+"""
+
+import errno
 import json
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,12 +15,23 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ..schemas.problems import InvalidInput
+from ..schemas.problems import InvalidInput, Problem
+from . import archive_commands, options
 from .calibrate_commands import app as calibrate_app
 from .job import log
-from .progress import log_to_stderr
+from .options import (
+    ClusterOption,
+    JsonOption,
+    LogJsonOption,
+    ParamsOption,
+    SchedulerOption,
+    SetOption,
+    VerboseOption,
+    WorkersOption,
+)
+from .progress import is_json, log_to_stderr
 
-FAILED, INVALID = 1, 2
+FAILED, INVALID, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 
 app = typer.Typer(
     name="seamosaic",
@@ -26,39 +42,71 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 app.add_typer(calibrate_app, name="calibrate")
+for command in (archive_commands.status, archive_commands.reprocess, archive_commands.compare, archive_commands.prune):
+    app.command()(command)
 _console = Console()
 _errors = Console(stderr=True)
 
 MissionArgument = Annotated[
     str, typer.Argument(metavar="MISSION", help="Mission folder, or any URL that fsspec reads.")
 ]
-ParamsOption = Annotated[Path | None, typer.Option("--params", metavar="FILE", help="YAML file of parameters.")]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="One parameter, e.g. grid.cell_m=0.05; repeatable."),
-]
 
 
 @app.command()
 def run(
-    mission: MissionArgument,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="OUT", help="Products go to OUT/<mission id>/v1, v2, ...")
+    mission: Annotated[
+        str, typer.Argument(metavar="MISSION|ARCHIVE", help="A mission, or a folder with archive.yaml: path or URL.")
     ],
+    out: Annotated[
+        str | None,
+        typer.Option("--out", "-o", metavar="OUT", help="Folder or s3://...; products go to OUT/<mission id>/v1, ..."),
+    ] = None,
     params: ParamsOption = None,
     set_: SetOption = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one a core.")] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler (tcp://...), or threads or sync.")
-    ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log every step that is computed.")] = False,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    cluster: ClusterOption = None,
+    as_json: JsonOption = False,
+    log_json: LogJsonOption = False,
+    verbose: VerboseOption = False,
 ) -> None:
-    """Process a mission: every product of one mission folder. What was computed before is not computed again."""
+    """Process a mission, or what is new or stale in an archive. What was computed before is not computed again."""
+    from ..catalog.archives import is_archive
     from . import run as runner
 
-    log_to_stderr(verbose)
-    result = runner.run(mission, out, _parameters(params, set_), scheduler, workers)
-    _print_result(result)
+    chosen = options.cluster(cluster, scheduler)
+    if is_archive(mission):
+        _refuse_beside_an_archive(out, params, set_)
+        archive_commands.run(mission, archive_commands.Running(scheduler, workers, chosen, as_json, log_json, verbose))
+        return
+    if out is None:
+        remedy = "Add -o OUT; an archive, which has archive.yaml, names it there."
+        raise InvalidInput([Problem("--out", None, "", "nothing", "the folder of the products", remedy)])
+    log_to_stderr(verbose, log_json)
+    result = runner.run(mission, out, options.parameters(params, set_), scheduler, workers, chosen)
+    log.info("mission=%s step=%s path=%s new=%s", result.quality.mission.id, "done", str(result.path), result.new)
+    if as_json:
+        _console.print_json(json.dumps(_summary(result)))
+    elif not log_json:
+        _print_result(result)
+
+
+def _refuse_beside_an_archive(out: str | None, params: Path | None, set_: list[str] | None) -> None:
+    for option, given in (("--out", out), ("--params", params), ("--set", set_)):
+        if given:
+            remedy = "Put it into archive.yaml; `seamosaic reprocess` gives some missions other parameters."
+            raise InvalidInput([Problem(option, None, "", str(given), "nothing, for an archive", remedy)])
+
+
+def _summary(result: Any) -> dict[str, Any]:
+    """A run for programs."""
+    return {
+        "mission": result.quality.mission.id,
+        "path": str(result.path),
+        "new": result.new,
+        "steps": [step.model_dump(mode="json") for step in result.steps],
+        "quality": result.quality.model_dump(mode="json"),
+    }
 
 
 @app.command()
@@ -66,7 +114,7 @@ def check(mission: MissionArgument, params: ParamsOption = None, set_: SetOption
     """Say everything that is wrong with a mission, and what `run` would make of it."""
     from . import check as checker
 
-    result = checker.check(mission, _parameters(params, set_))
+    result = checker.check(mission, options.parameters(params, set_))
     checker.print_check(result, _console)
     if not result.valid:
         raise typer.Exit(INVALID)
@@ -117,9 +165,9 @@ def demo(out: Annotated[Path, typer.Argument(metavar="OUT", help="A new or an ea
     if not mission.exists():
         _console.print("Making a small mission over a simulated reef ...")
         simulator.simulate("demo", mission)
-    result = runner.run(str(mission), out / "products", _parameters(None, None))
+    result = runner.run(str(mission), str(out / "products"), options.parameters(None, None))
     _print_result(result)
-    measured = evaluator.evaluate(result.path, mission)
+    measured = evaluator.evaluate(str(result.path), mission)
     _console.print("Against the simulation's truth:")
     _console.print_json(json.dumps(measured))
     _console.print(Text(f"\nLook at {result.path / 'report.html'} in a browser,"))
@@ -129,20 +177,6 @@ def demo(out: Annotated[Path, typer.Argument(metavar="OUT", help="A new or an ea
 def _overrides(images: int | None, width: int | None) -> dict[str, Any]:
     given = {"images": images, "width": width}
     return {name: value for name, value in given.items() if value is not None}
-
-
-def _parameters(params: Path | None, overrides: list[str] | None):
-    from ..schemas.problems import Problem
-    from ..schemas.yaml_input import load_parameters
-
-    text = None
-    if params is not None:
-        try:
-            text = params.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            problem = Problem("--params", None, "", str(error), "a YAML file of parameters", "Correct the path.")
-            raise InvalidInput([problem]) from error
-    return load_parameters(text, str(params), overrides or [])
 
 
 def _print_result(result: Any) -> None:
@@ -155,7 +189,7 @@ def _print_result(result: Any) -> None:
         table.add_column(name, justify="right")
     for step in result.steps:
         table.add_row(step.name, str(step.count_computed), str(step.count_reused), f"{step.core_seconds:.1f}")
-    _console.print(table)
+    _console.print(table if result.steps else table.title)
     figures = Table(show_header=False, box=None)
     for name, value in _figures(quality):
         figures.add_row(name, value)
@@ -179,20 +213,40 @@ def _figures(quality: Any):
 
 def main() -> None:
     """Entry point: every error that a user can cause becomes a message and an exit code."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # workers are ended and leftovers removed
     try:
         app()
     except InvalidInput as error:
         from .check import print_problems
 
-        print_problems(error.problems, "invalid input", _errors)
+        if is_json():
+            for problem in error.problems:
+                log.error("step=%s %s", "invalid", problem)
+        else:
+            print_problems(error.problems, "invalid input", _errors)
         sys.exit(INVALID)
-    except KeyboardInterrupt:
-        _errors.print("Stopped. Run the same command again to go on from here.")
-        sys.exit(FAILED)
+    except SystemExit as left:
+        if left.code in (INTERRUPTED, TERMINATED):
+            _say("stopped; run the same command again to go on from here")
+        raise
     except Exception as error:  # the last resort: a message for the user, the traceback with --verbose
         log.debug("failed", exc_info=True)
-        _errors.print(Text("failed ", "red") + Text(str(error)))
+        _say(f"failed: {str(error) or type(error).__name__}{_remedy(error)}")
         sys.exit(FAILED)
+
+
+def _remedy(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "; make room, then run the same command again to go on from here"
+    return ""
+
+
+def _say(why: str) -> None:
+    """The last word, in the log where that is JSON."""
+    if is_json():
+        log.error("step=%s %s", "end", why)
+    else:
+        _errors.print(Text(why, "red"))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..tasks import dense, dense_cells, laser, tiepoints
+from ..tasks import dense, dense_cells, dense_refine, laser, tiepoints
 from ..tasks.dense_cells import PairCells
 from . import extract, match, solve
 from .job import Done, Made, code_version, load, once, stage
@@ -23,8 +23,7 @@ _DEPTH_MARGIN = 0.08  # of the depth
 _IMAGES_KEPT = 4
 _WITHIN_CELLS = 0.5
 # where no laser tells: half a pixel of dense matching, which is on smaller images, and one of tie points
-_DENSE_PX, _TIE_PX, _UNKNOWN_M = 0.5, 1.0, 1.0
-_NO_DIFFERENCES = dense_cells.Differences(np.zeros(0), np.zeros(0))
+_DENSE_PX, _TIE_PX, UNKNOWN_M = 0.5, 1.0, 1.0
 
 
 class DensePair(NamedTuple):
@@ -85,9 +84,12 @@ def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
     sights = [dense.sight(camera, made, poses.R_local_camera[k], k == j) for k in (i, j)]
     pixels = [view(image) for image in (pair.i, pair.j)]
     warped = [dense.warp(made, seen, *of, scale) for seen, of in zip(sights, pixels, strict=True)]
-    relief = dense.points(made, dense.disparity(made, *warped), *sights)
+    found = dense_refine.refine(dense.disparity(made, *warped), *warped)
+    relief = dense.points(made, found, *sights)
     to_map = m.frame.map_from_local
-    cells = dense_cells.reduce_to_cells(to_map(relief.X_local), relief.metres_per_px, to_map(known), m.cell_m)
+    cells = dense_cells.reduce_to_cells(
+        to_map(relief.X_local), relief.metres_per_px, relief.noise_px, to_map(known), m.cell_m
+    )
     return Made(cells._asdict(), {"cells": len(cells.X_map)})
 
 
@@ -120,31 +122,31 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
     """How well matching agrees with the laser over some pairs.
 
     The info has the 1-sigma of dense matching and tie points in pixels of disparity, dense_px and tie_px, and that of
-    the laser's elevations by its images' poses, laser_m (1 m where nothing tells; bend_m then is 0).
+    the laser's elevations by its images' poses, laser_m (UNKNOWN_M where nothing tells).
 
     pairs : each with the key of its dense matching, "" without, and the images that touch it.
     """
     solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
 
     def make() -> Made:
-        dense_off, tie_off = [_NO_DIFFERENCES], [_NO_DIFFERENCES]
+        dense_off, tie_off = [dense_cells.NO_DIFFERENCES], [dense_cells.NO_DIFFERENCES]
         for pair, key, around in pairs:
             to_map, within = m.frame.map_from_local, _WITHIN_CELLS * m.cell_m
-            lit = to_map(np.concatenate([sounded(m, image, solution) for image in around]))
+            lit = [to_map(sounded(m, image, solution)) for image in around]
             ties = _ties(m, pair, solution)
-            tie_off.append(dense_cells.differences(to_map(ties.X_local), ties.metres_per_px, lit, within))
+            there = to_map(ties.X_local)
+            tie_off.append(dense_cells.differences(there, ties.metres_per_px, np.concatenate(lit), within))
             if key:
                 cells = read_cells(m, key)
-                sure = cells.borne_out
-                dense_off.append(dense_cells.differences(cells.X_map[sure], cells.metres_per_px[sure], lit, within))
+                X, scale = cells.X_map[cells.borne_out], cells.metres_per_px[cells.borne_out]
+                dense_off += [dense_cells.departures(X, scale, soundings, m.cell_m) for soundings in lit]
         dense_m, dense_px = (np.concatenate(values) for values in zip(*dense_off, strict=True))
         tie_m, tie_px = (np.concatenate(values) for values in zip(*tie_off, strict=True))
         found = {
             "dense_px": dense_cells.share_of_each(dense_px, _DENSE_PX),
             "tie_px": dense_cells.share_of_each(tie_px, _TIE_PX),
-            "laser_m": dense_cells.share_of_each(dense_m if len(dense_m) else tie_m, _UNKNOWN_M),
+            "laser_m": dense_cells.share_of_each(dense_m if len(dense_m) else tie_m, UNKNOWN_M),
         }
-        found["bend_m"] = found["laser_m"] if found["laser_m"] < _UNKNOWN_M else 0.0
         return Made({}, {name: round(value, 4) for name, value in found.items()})
 
     rows = sorted({image.row for pair, _, around in pairs for image in (pair.i, pair.j, *around)})

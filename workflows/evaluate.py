@@ -110,7 +110,7 @@ def _newest(products: Path) -> Path:
         return products
     newest = versions.newest_version(products.parent, products.name)
     if newest is not None:
-        return newest.path
+        return Path(str(newest.path))
     below = [p.name for p in sorted(products.iterdir()) if p.is_dir()] if products.is_dir() else []
     missions = [name for name in below if versions.newest_version(products, name) is not None]
     if len(missions) > 1:
@@ -118,7 +118,7 @@ def _newest(products: Path) -> Path:
     newest = versions.newest_version(products, missions[0]) if missions else None
     if newest is None:
         raise _wrong(products, "no products", "OUT, OUT/<mission id> or a version", "Run `seamosaic run` first.")
-    return newest.path
+    return Path(str(newest.path))
 
 
 def _horizontal(crs: Any) -> pyproj.CRS | None:

@@ -1,5 +1,6 @@
 """Per image: decoded once; laser soundings, features and colour statistics into the store."""
 
+import math
 import sys
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,23 +8,32 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..catalog.images import UnreadableImage, read_image
+from ..catalog.images import MissingImage, UnreadableImage, read_image
 from ..schemas.calibration import Laser
 from ..schemas.mission import Role
 from ..tasks import colour, features, laser, triangulation
-from .job import Done, Job, Made, code_version, log, once, stage
+from .job import Done, Job, Made, code_version, once, stage
 
 STEP = "extract"
 VERSION = code_version(sys.modules[__name__])
 
 
 class ImageTask(NamedTuple):
-    """An image to extract: its row in the frames table, path, digest and role."""
+    """An image to extract: its row in the frames table, path, digest and role.
+
+    north_deg : direction of north in it, from u towards v, where the headings of all images are known.
+    """
 
     row: int
     path: str
     sha256: str
     role: Role
+    north_deg: int | None = None
+
+    @property
+    def north_rad(self) -> float | None:
+        """`north_deg` in radians."""
+        return None if self.north_deg is None else math.radians(self.north_deg)
 
 
 def extract_batch(job: Job, batch: Sequence[ImageTask]) -> list[Done]:
@@ -37,6 +47,7 @@ def _extract(job: Job, image: ImageTask) -> Done:
     light = calibration.laser if image.role != "texture" else None
     parameters = [
         image.role,
+        image.north_deg,
         *stage(calibration.camera, job.parameters.laser, job.parameters.features),
         light.model_dump(mode="json") if light else None,
     ]
@@ -45,17 +56,16 @@ def _extract(job: Job, image: ImageTask) -> Done:
         try:
             bgr = read_verified(job, image.path, image.sha256)
         except UnreadableImage as error:
-            return Made({}, _rejected(job, image, error))
-        return _measure(job, image.role, light, bgr)
+            return Made({}, _rejected(error))
+        return _measure(job, image, light, bgr)
 
     try:
         return once(job, STEP, VERSION, [image.sha256], parameters, make)
-    except OSError as error:  # not the image's fault, so not to be remembered: the next run tries again
-        return Done(STEP, "", True, 0.0, _rejected(job, image, error))
+    except MissingImage as error:  # not the image's fault, so not to be remembered: the next run tries again
+        return Done(STEP, "", True, 0.0, _rejected(error))
 
 
-def _rejected(job: Job, image: ImageTask, error: Exception) -> dict:
-    log.warning("mission=%s step=%s image=%s rejected: %s", job.mission_id, STEP, image.path, error)
+def _rejected(error: Exception) -> dict:
     return {"status": f"rejected: {error}", "soundings": 0, "features": 0}
 
 
@@ -66,16 +76,18 @@ def read_verified(job: Job, path: str, sha256: str, reduce: int = 1) -> np.ndarr
     ------
     UnreadableImage
         It cannot be decoded.
-    OSError
+    MissingImage
         It cannot be read now, or it changed since.
+    ObjectStoreError
+        The object store does not give it.
     """
     decoded = read_image(job.mission_url, path, job.calibration.camera, reduce)
     if decoded.sha256 != sha256:
-        raise OSError(f"{path} changed while the mission was being processed; run again")
+        raise MissingImage(f"{path} changed while the mission was being processed; run again")
     return decoded.bgr
 
 
-def _measure(job: Job, role: Role, light: Laser | None, bgr: np.ndarray) -> Made:
+def _measure(job: Job, image: ImageTask, light: Laser | None, bgr: np.ndarray) -> Made:
     arrays, reason = {}, ""
     erase = np.zeros(bgr.shape[:2], bool)
     count, range_m, sigma_m, halfwidth_px, agreement = 0, None, None, 0.0, None
@@ -94,9 +106,9 @@ def _measure(job: Job, role: Role, light: Laser | None, bgr: np.ndarray) -> Made
             "line_uv": found.line_uv,
         }
     feature_count = 0
-    if role != "laser":
+    if image.role != "laser":
         grey = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-        points = features.detect(grey, erase, job.parameters.features)
+        points = features.detect(grey, erase, job.parameters.features, image.north_rad)
         feature_count = len(points.uv)
         arrays |= {
             "feature_uv": points.uv,

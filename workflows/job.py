@@ -17,6 +17,7 @@ from ..catalog.store import Entry, Store, digest
 from ..schemas.base import Model
 from ..schemas.calibration import Calibration
 from ..schemas.parameters import Parameters
+from .footing import Footing, stand
 
 log = logging.getLogger("seamosaic")
 
@@ -26,13 +27,17 @@ _LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "gtsam", "pyproj")
 
 
 class Job(NamedTuple):
-    """A mission being processed; small and picklable, it goes with every task."""
+    """A mission being processed; small and picklable, it goes with every task.
+
+    footing : what every process that computes must have in common with this one; None where there is no other.
+    """
 
     mission_url: str
     mission_id: str
     store: Store
     calibration: Calibration
     parameters: Parameters
+    footing: Footing | None = None
 
 
 class Done(NamedTuple):
@@ -104,9 +109,12 @@ def once(
     compress: bool | Collection[str] = False,
 ) -> Done:
     """The stored result of a step, made now if the store does not have it."""
+    if job.footing is not None:
+        stand(job.mission_url, job.store, job.footing)
     key = digest(step, code, inputs, parameters)
     known = job.store.info(step, key)
     if known is not None:
+        job.store.touch(step, key)
         return Done(step, key, False, float(known["seconds"]), known)
     started = time.process_time()
     made = make()
@@ -123,12 +131,12 @@ def load(job: Job, step: str, key: str, names: Collection[str] | None = None) ->
     Raises
     ------
     LostEntry
-        If it is gone or damaged; a rerun makes it again.
+        If it is gone or damaged; then it is forgotten, so that going over the steps again makes it anew.
     """
     entry = job.store.get(step, key, names)
     if entry is None:
         job.store.remove(step, key)
-        raise LostEntry(f"{job.store.path(step, key)} is gone or damaged; run again to make it anew")
+        raise LostEntry(f"{job.store.path(step, key)} is gone or damaged and has to be made anew")
     return entry
 
 

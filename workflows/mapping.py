@@ -3,23 +3,24 @@
 from collections.abc import Sequence
 
 import numpy as np
-from dask.delayed import delayed
+from dask.delayed import Delayed, delayed
 
 from ..tasks import camera as cameras
 from ..tasks import grids, pairs
 from ..tasks.grids import Grid
-from . import dense, maps, mosaics
+from . import dense, layers, maps, meshing, mosaics
 from .job import Done
 from .maps_inputs import Image, MapJob, Pair, Tile
 from .plan import batches
-from .results import Mapped, Posed, Tiles
+from .results import Mapped, Posed, TerrainLayers, Tiles
 from .session import Session, compute
 from .solve import Solution
 
 _LIGHTING_IMAGES = 200
-_GROWTH_TILES = 6
+_GROWTH_CELLS = 6 * 512 * 512
 _RELIEF_SHARE = 0.3
 _WORST_SIGMA = 1 / 75  # of the range: what interpolation knows less of it does not know
+_LEAST_SEEN = 0.91  # of the ground that images see: where that is mapped, what is less certain stays empty
 _PAIRS_A_BATCH = 8
 _AGREEMENT_PAIRS = 60
 
@@ -41,19 +42,22 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     mosaic_cell = grids.mosaic_cell_m(gsd) if p.mosaic.cell_m == "auto" else float(p.mosaic.cell_m)
     reach = max(1.0, typical / 3) if p.grid.max_interpolation_m == "auto" else float(p.grid.max_interpolation_m)
     worst = typical * _WORST_SIGMA if p.grid.max_sigma_m == "auto" else float(p.grid.max_sigma_m)
-    m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst)
+    enough = _LEAST_SEEN if p.grid.max_sigma_m == "auto" else 1.0
+    m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst, enough)
     outlines = _outlines(state, posed.solution, ranges)
     # what is costly does not change with the bathymetry's cell: matching is kept as fine as either of the cells, and
     # mosaics lie on a surface of their own
     usual = grids.bathymetry_cell_m(gsd)
     linked, agreed = _dense(state, m._replace(cell_m=min(cell, usual)), posed, images, outlines, ranges)
     surface_tiles = _surface(state, m, linked, agreed, images, outlines)
+    terrain = _layers(state, m, surface_tiles)
     below = m._replace(cell_m=usual)
     ground = surface_tiles if below == m else _surface(state, below, linked, agreed, images, outlines)
     textured = [image for image in images if image.texture]
     light = _lighting(state, below, textured)
     mosaic = _mosaics(state, below, textured or images, outlines, ground, mosaic_cell, light, posed)
-    return Mapped(m, cell, mosaic_cell, surface_tiles, mosaic, outlines)
+    pyramid = _mesh(state, m, textured, outlines, surface_tiles, mosaic, light)
+    return Mapped(m, cell, mosaic_cell, surface_tiles, terrain, mosaic, pyramid, outlines)
 
 
 def _images(state: Session, posed: Posed, ranges: np.ndarray) -> list[Image]:
@@ -129,7 +133,7 @@ def _dense(
     wanted = _wanted(state, posed, linked, outlines, ranges)
     described = [dense.DensePair(by_row[pair.i], by_row[pair.j], pair.key) for pair in wanted]
     tasks = [
-        delayed(dense.dense_batch)(m, batch, dask_key_name=f"dense-{k}")
+        delayed(dense.dense_batch)(m, batch, dask_key_name=state.key("dense", k))
         for k, batch in enumerate(batches(described, _PAIRS_A_BATCH))
     ]
     made: list[Done] = [done for part in compute(state, dense.STEP, tasks) for done in part]
@@ -143,7 +147,9 @@ def _dense(
         )
         for pair in (wanted or linked)[::every]
     ]
-    (agreed,) = compute(state, dense.AGREEMENT, [delayed(dense.agreement)(m, sampled, dask_key_name="agreement")])
+    (agreed,) = compute(
+        state, dense.AGREEMENT, [delayed(dense.agreement)(m, sampled, dask_key_name=state.key("agreement"))]
+    )
     state.ledger.end(dense.STEP, made)
     state.ledger.end(dense.AGREEMENT, [agreed])
     return [pair._replace(dense=keys.get((pair.i, pair.j), "")) for pair in linked], agreed
@@ -186,33 +192,68 @@ def _surface(
     for step in steps:
         state.ledger.begin(step)
     tiles = list(grids.tiles(grid, size))
-    cell_tasks = []
-    for k, tile in enumerate(tiles):
-        touching = _touching(outlines, images, tile, margin)
-        described = Tile(tile, touching, _of_images(linked, touching))
-        name = f"cells-{m.cell_m:g}-{k}"
-        cell_tasks.append(delayed(maps.cells_tile)(m, described, agreed, dask_key_name=name))
+    touching = [_touching(outlines, images, tile, margin) for tile in tiles]
+    cell_tasks = [
+        delayed(maps.cells_tile)(
+            m, Tile(tile, seen, _of_images(linked, seen)), agreed, dask_key_name=state.key(f"cells-{m.cell_m:g}", k)
+        )
+        for k, (tile, seen) in enumerate(zip(tiles, touching, strict=True))
+    ]
     cells: list[Done] = compute(state, maps.CELLS, cell_tasks)
     if not any(done.info["sounded"] for done in cells):
         raise NothingToMap(
             "no image gave a laser sounding, and no two images could be linked (without navigation only the laser "
             "gives links their scale): there is nothing to map"
         )
-    order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:_GROWTH_TILES]
-    sampled = [(tiles[k], cells[k]) for k in sorted(order)]
-    task = delayed(maps.fit_growth)(m, sampled, dask_key_name=f"growth-{m.cell_m:g}")
-    (growth,) = compute(state, maps.GROWTH, [task])
     halo = maps.surface.halo_cells(m.max_interpolation_m, m.cell_m)
-    surface_tasks = []
-    for k, tile in enumerate(tiles):
-        around = grids.pad(tile, halo)
-        near = [(t, done) for t, done in zip(tiles, cells, strict=True) if grids.intersection(around, t)]
-        name = f"surface-{m.cell_m:g}-{k}"
-        surface_tasks.append(delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=name))
+    around = [_around(tile, halo, tiles, cells) for tile in tiles]
+    count = max(1, _GROWTH_CELLS // (size * size))
+    order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:count]
+    samples = [maps.Sample(tiles[k], around[k], outlines[[image.row for image in touching[k]]]) for k in sorted(order)]
+    task = delayed(maps.fit_growth)(m, samples, dask_key_name=state.key(f"growth-{m.cell_m:g}"))
+    (growth,) = compute(state, maps.GROWTH, [task])
+    surface_tasks = [
+        delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=state.key(f"surface-{m.cell_m:g}", k))
+        for k, (tile, near) in enumerate(zip(tiles, around, strict=True))
+    ]
     surfaces: list[Done] = compute(state, maps.SURFACE, surface_tasks)
     for step, done in zip(steps, (cells, [growth], surfaces), strict=True):
         state.ledger.end(step, done)
     return Tiles(grid, tuple(zip(tiles, surfaces, strict=True)))
+
+
+def _around(tile: Grid, halo: int, tiles: Sequence[Grid], cells: Sequence[Done]) -> list[tuple[Grid, Done]]:
+    """The tiles that a tile with its halo needs, and their cells."""
+    wide = grids.pad(tile, halo)
+    return [(other, done) for other, done in zip(tiles, cells, strict=True) if grids.intersection(wide, other)]
+
+
+def _layers(state: Session, m: MapJob, surface: Tiles) -> TerrainLayers:
+    """Habitat layers of each tile, then its contours, whose interval is one for the whole map."""
+    halo = layers.reach(state.job.parameters.terrain, m.cell_m)
+    for step in (layers.TERRAIN, layers.CONTOURS):
+        state.ledger.begin(step)
+
+    def near(grid: Grid) -> list[tuple[Grid, Done]]:
+        return [(tile, done) for tile, done in surface.tiles if grids.intersection(grid, tile)]
+
+    tasks = [
+        delayed(layers.terrain_tile)(m, tile, near(grids.pad(tile, halo)), dask_key_name=state.key("terrain", k))
+        for k, (tile, _) in enumerate(surface.tiles)
+    ]
+    made: list[Done] = compute(state, layers.TERRAIN, tasks)
+    interval = layers.contour_interval_m(made)
+    tasks = [
+        delayed(layers.contour_tile)(
+            m, tile, near(layers.contour_grid(tile)), interval, dask_key_name=state.key("contours", k)
+        )
+        for k, (tile, _) in enumerate(surface.tiles)
+    ]
+    lines: list[Done] = compute(state, layers.CONTOURS, tasks)
+    for step, done in ((layers.TERRAIN, made), (layers.CONTOURS, lines)):
+        state.ledger.end(step, done)
+    tiles = tuple((tile, done) for (tile, _), done in zip(surface.tiles, made, strict=True))
+    return TerrainLayers(Tiles(surface.grid, tiles), tuple(lines), interval)
 
 
 def _lighting(state: Session, m: MapJob, images: Sequence[Image]) -> Done | None:
@@ -220,7 +261,7 @@ def _lighting(state: Session, m: MapJob, images: Sequence[Image]) -> Done | None
         return None
     state.ledger.begin(mosaics.LIGHTING)
     every = max(1, len(images) // _LIGHTING_IMAGES)
-    task = delayed(mosaics.lighting)(m, list(images[::every]), dask_key_name="lighting")
+    task = delayed(mosaics.lighting)(m, list(images[::every]), dask_key_name=state.key("lighting"))
     (light,) = compute(state, mosaics.LIGHTING, [task])
     state.ledger.end(mosaics.LIGHTING, [light])
     return light
@@ -242,7 +283,9 @@ def _mosaics(
     for step in (mosaics.ALIGN, mosaics.MOSAIC):
         state.ledger.begin(step)
     linked = _of_images(_linked(posed), shown)
-    (aligned,) = compute(state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name="align")])
+    (aligned,) = compute(
+        state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name=state.key("align"))]
+    )
     tiles = list(grids.tiles(grid, state.job.parameters.mosaic.tile_cells))
     margin = _margin(outlines, shown)
     tasks = []
@@ -250,11 +293,46 @@ def _mosaics(
         described = Tile(tile, _touching(outlines, shown, tile, margin))
         around = maps.ground_around(tile, ground.grid.cell_m, m.max_interpolation_m)
         near = [(t, done) for t, done in ground.tiles if grids.intersection(around, t)]
-        tasks.append(delayed(mosaics.mosaic_tile)(m, described, near, aligned, light, dask_key_name=f"mosaic-{k}"))
+        tasks.append(
+            delayed(mosaics.mosaic_tile)(m, described, near, aligned, light, dask_key_name=state.key("mosaic", k))
+        )
     done: list[Done] = compute(state, mosaics.MOSAIC, tasks)
     for step, results in ((mosaics.ALIGN, [aligned]), (mosaics.MOSAIC, done)):
         state.ledger.end(step, results)
     return Tiles(grid, tuple(zip(tiles, done, strict=True)))
+
+
+def _mesh(
+    state: Session,
+    m: MapJob,
+    images: Sequence[Image],
+    outlines: np.ndarray,
+    ground: Tiles,
+    mosaic: Tiles,
+    light: Done | None,
+) -> dict[meshing.Place, Done]:
+    """The pyramid of mesh tiles, each level from the one below."""
+    state.ledger.begin(meshing.MESH)
+    margin, cell = _margin(outlines, images), mosaic.grid.cell_m
+    finest, *coarser = meshing.levels(list(meshing.leaves(ground.grid)))
+    tasks: dict[meshing.Place, Delayed] = {}
+    for place in finest:
+        own, around, texture = meshing.leaf_inputs(m, place, cell)
+        near = [(tile, done) for tile, done in ground.tiles if grids.intersection(around, tile)]
+        pictures = [(tile, done) for tile, done in mosaic.tiles if grids.intersection(texture, tile)]
+        shown = _touching(outlines, images, own, margin)
+        given = (m, place, shown, near, pictures, light, cell)
+        tasks[place] = delayed(meshing.leaf)(*given, dask_key_name=state.key(f"mesh-{'-'.join(map(str, place))}"))
+    below = finest
+    for level in coarser:
+        for place in level:
+            children = [(child, tasks[child]) for child in below if child.parent == place]
+            name = state.key(f"mesh-{'-'.join(map(str, place))}")
+            tasks[place] = delayed(meshing.parent)(m, place, children, dask_key_name=name)
+        below = level
+    made: list[Done] = compute(state, meshing.MESH, list(tasks.values()))
+    state.ledger.end(meshing.MESH, made)
+    return dict(zip(tasks, made, strict=True))
 
 
 def range_of(done: Done | None, fallback: float) -> float:

@@ -2,30 +2,35 @@
 
 import sys
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from ..tasks import gridding, grids, surface
+from ..tasks import gridding, grids, smooth, surface
 from ..tasks.gridding import LASER, MATCHING, Cells, Soundings
 from ..tasks.grids import Grid
 from ..tasks.surface import Growth
 from . import dense, extract, solve
-from .job import Done, Job, Made, code_version, load, once
+from .job import Done, Job, Made, array_digest, code_version, load, once
 from .maps_inputs import Image, MapJob, Pair, Tile, context, pose_digest, rows_of
 from .solve import Solution
 
 CELLS, GROWTH, SURFACE = "cells", "growth", "surface"
 _VERSION = code_version(sys.modules[__name__])
 _LEAST_HALO = 6  # cells
-# Of the variance of matching: what is a cell's own, what a pair's poses do to all of its cells, and what neighbouring
-# pairs have in common, as they share images and the bend of the whole, so that it does not average down
-_OWN, _SHARED, _BEND = 0.25, 0.35, 0.4
+# Of the variance that poses give to matching: what a pair's poses do to all of its cells, and what neighbouring pairs
+# have in common, as they share images and the bend of the whole, so that it does not average down
+_SHARED, _BEND = 0.5, 0.5
+_LEAST_NOISE_PX = 0.02
+_TRUST = 2 / 3  # in what laser and matching say of each other, against what the adjustment says
 
 
 def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
     """Soundings, tie points and dense matching of a tile, gridded. agreed : by `dense.agreement`."""
     solution = relative(solve.solution(load(m.job, solve.STEP, m.adjusted)), agreed.info["laser_m"])
-    inputs = [f"{image.row}:{image.key}" for image in tile.images] + [pose_digest(solution, rows_of(tile)), agreed.key]
+    # what was found and not from what: another image elsewhere is no reason to make this tile anew
+    said = [agreed.info[name] for name in ("dense_px", "tie_px")] + [round(_bend_m(solution, agreed), 4)]
+    inputs = [f"{image.row}:{image.key}" for image in tile.images] + [pose_digest(solution, rows_of(tile))]
     inputs += [f"{pair.i}-{pair.j}:{pair.key}:{pair.dense}" for pair in tile.pairs]
 
     def make() -> Made:
@@ -37,18 +42,19 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
                 parts.append(_dense(m, pair, count, agreed.info["dense_px"]))
         soundings = Soundings._make(np.concatenate(column) for column in zip(_NOTHING, *parts, strict=True))
         cells = gridding.grid_soundings(tile.grid, soundings)
-        cells = cells._replace(sigma=np.hypot(cells.sigma, np.sqrt(_BEND) * agreed.info["bend_m"]))
+        cells = cells._replace(sigma=np.hypot(cells.sigma, np.sqrt(_BEND) * said[-1]))
         return Made(cells._asdict(), {"sounded": int((cells.density > 0).sum())})
 
-    return once(m.job, CELLS, _VERSION, inputs, context(m, tile), make, compress=True)
+    return once(m.job, CELLS, _VERSION, inputs, [context(m, tile), said], make, compress=True)
 
 
 def relative(solution: Solution, measured_m: float) -> Solution:
     """The solution with sigmas relative to the map itself, where matches hold its images together.
 
     What all images share, the error of the datum, is no error of one cell against another: the sigma of the best
-    image stands for it and is taken off. What is left is made smaller where laser and matching agree better than it
-    says, to measured_m, 1-sigma of the elevation. Images that navigation alone places keep theirs.
+    image stands for it and is taken off. What is left is too cautious where all images hold each other well, and laser
+    and matching agree better than it says, to measured_m, 1-sigma of the elevation; but these see nothing of what bends
+    neighbours alike. The mean of both, on a scale of ratios, counts. Images that navigation alone places keep theirs.
     """
     held = np.array([status == "adjusted" for status in solution.status], bool) & solution.poses.known
     if not held.any():
@@ -57,9 +63,17 @@ def relative(solution: Solution, measured_m: float) -> Solution:
     for values in (sigma_m, tilt):
         own = values[held]
         values[held] = np.sqrt(np.maximum(own**2 - own.min(0) ** 2, 0))
-    calm = min(1.0, measured_m / max(float(np.median(sigma_m[held, 2])), 1e-6))
+    calm = min(1.0, measured_m / max(float(np.median(sigma_m[held, 2])), 1e-6)) ** _TRUST
     sigma_m[held], tilt[held] = calm * sigma_m[held], calm * tilt[held]
     return solution._replace(sigma_m=sigma_m, sigma_tilt_rad=tilt)
+
+
+def _bend_m(solution: Solution, agreed: Done) -> float:
+    """1-sigma of the elevation by the poses, as neighbouring images share it; 0 where nothing tells."""
+    held = np.array([status == "adjusted" for status in solution.status], bool) & solution.poses.known
+    return (
+        float(np.median(solution.sigma_m[held, 2])) if held.any() and agreed.info["laser_m"] < dense.UNKNOWN_M else 0.0
+    )
 
 
 def _soundings(X_map: np.ndarray, sigma: np.ndarray, source: int, frame: int, shared: np.ndarray) -> Soundings:
@@ -96,34 +110,65 @@ def _dense(m: MapJob, pair: Pair, images: int, dense_px: float) -> Soundings:
     """One sounding a cell, numbered as one more frame for the pair: what it errs by is its poses', mostly."""
     cells = dense.read_cells(m, pair.dense)
     sigma, number = dense_px * cells.metres_per_px, images * (pair.i + 1) + pair.j
-    found = _soundings(cells.X_map, np.sqrt(_OWN) * sigma, MATCHING, number, np.sqrt(_SHARED) * sigma)
+    noise = np.maximum(cells.noise_px, _LEAST_NOISE_PX) * cells.metres_per_px
+    found = _soundings(cells.X_map, noise, MATCHING, number, np.sqrt(_SHARED) * sigma)
     return found._replace(doubtful=~cells.borne_out)
 
 
-def fit_growth(m: MapJob, tiles: Sequence[tuple[Grid, Done]]) -> Done:
-    """How interpolation errs on this seabed, from soundings held out in some of its tiles."""
+class Sample(NamedTuple):
+    """A tile that tells how interpolation errs: with the tiles around it, and the outlines (K, M, 2) of its images."""
+
+    tile: Grid
+    neighbours: Sequence[tuple[Grid, Done]]
+    outlines: np.ndarray
+
+
+def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
+    """How interpolation errs on this seabed, from soundings held out in some of its tiles; and which guesses to show.
+
+    Interpolated cells are shown as long as they are more certain than max_sigma_m of the info: no more of them than it
+    takes to map `m.least_seen` of the ground that images have seen, and none less certain than m.max_sigma_m.
+    """
 
     def make() -> Made:
-        found = [
-            surface.hold_out(grid, _cells(m.job, grid, [(grid, done)]), m.max_interpolation_m) for grid, done in tiles
-        ]
-        joined = surface.Holdout(*(np.concatenate(column) for column in zip(*found, strict=True)))
-        return Made({}, surface.fit_growth(joined)._asdict())
+        halos = [_halo(m, sample.tile) for sample in samples]
+        cells = [_cells(m.job, halo, sample.neighbours) for halo, sample in zip(halos, samples, strict=True)]
+        held = [_hold_out(m, *each) for each in zip(samples, halos, cells, strict=True)]
+        law = surface.fit_growth(surface.Holdout(*(np.concatenate(column) for column in zip(*held, strict=True))))
+        sigma = [np.zeros(0)]
+        for sample, halo, known in zip(samples, halos, cells, strict=True):
+            inner = grids.window(halo, sample.tile)
+            found = surface.delaunay_surface(halo, known, m.max_interpolation_m, law)
+            seen = surface.seen(sample.tile, sample.outlines)
+            sigma.append(np.where(known.density[inner] > 0, 0.0, found.sigma[inner])[seen])
+        worst = surface.worst_shown(np.concatenate(sigma), m.least_seen, m.max_sigma_m)
+        return Made({}, {**law._asdict(), "max_sigma_m": worst})
 
-    inputs = [done.key for _, done in tiles]
-    return once(m.job, GROWTH, _VERSION, inputs, [m.max_interpolation_m], make)
+    inputs = [done.key for sample in samples for _, done in sample.neighbours]
+    inputs.append(array_digest(*(np.round(sample.outlines, 3) for sample in samples)))
+    parameters = [m.max_interpolation_m, m.max_sigma_m, m.least_seen, [list(sample.tile) for sample in samples]]
+    return once(m.job, GROWTH, _VERSION, inputs, parameters, make)
+
+
+def _hold_out(m: MapJob, sample: Sample, halo: Grid, cells: Cells) -> surface.Holdout:
+    inner = grids.window(halo, sample.tile)
+    return surface.hold_out(sample.tile, Cells._make(values[inner] for values in cells), m.max_interpolation_m)
+
+
+def _halo(m: MapJob, tile: Grid) -> Grid:
+    return grids.pad(tile, surface.halo_cells(m.max_interpolation_m, tile.cell_m))
 
 
 def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]], growth: Done) -> Done:
     """The Delaunay surface of a tile from the cells of the tiles around it."""
-    law = Growth(*(growth.info[name] for name in Growth._fields))
+    law, worst = Growth(*(growth.info[name] for name in Growth._fields)), growth.info["max_sigma_m"]
     inputs = [done.key for _, done in neighbours]
 
     def make() -> Made:
-        halo = grids.pad(tile, surface.halo_cells(m.max_interpolation_m, tile.cell_m))
+        halo = _halo(m, tile)
         cells = _cells(m.job, halo, neighbours)
         found = surface.delaunay_surface(halo, cells, m.max_interpolation_m, law)
-        mapped = surface.without_guesses(found, m.max_sigma_m)
+        mapped = surface.without_guesses(found, worst)
         inner = grids.window(halo, tile)
         layers = {
             "elevation": mapped.elevation.astype(np.float32),
@@ -136,7 +181,7 @@ def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]],
         cut = {name: values[inner] for name, values in layers.items()}
         return Made(cut, {"cells": int(np.isfinite(cut["elevation"]).sum())})
 
-    parameters = [list(tile), m.max_interpolation_m, m.max_sigma_m, list(law)]
+    parameters = [list(tile), m.max_interpolation_m, worst, list(law)]
     return once(m.job, SURFACE, _VERSION, inputs, parameters, make, compress=True)
 
 
@@ -144,6 +189,7 @@ def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]]) -> Cells:
     empty = Cells(
         elevation=np.full(grid.shape, np.nan),
         sigma=np.full(grid.shape, np.nan),
+        noise=np.full(grid.shape, np.nan),
         density=np.zeros(grid.shape, np.int32),
         source=np.zeros(grid.shape, np.uint8),
         x=np.full(grid.shape, np.nan),
@@ -153,7 +199,7 @@ def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]]) -> Cells:
         entry = load(job, CELLS, done.key)
         for name, values in empty._asdict().items():
             paste(grid, values, tile, entry.arrays[name])
-    return empty
+    return smooth.matched(grid, empty)
 
 
 def paste(grid: Grid, values: np.ndarray, tile: Grid, part: np.ndarray) -> None:

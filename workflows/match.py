@@ -55,7 +55,8 @@ PairSoundings = tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]
 _HALF_TURNS = (True, True), (False, True), (True, False)
 _ALIKE_DEG = 20.0
 _ALIKE_COSINE = 0.7
-_STRONGEST = 2000  # features of images far apart in time that are asked whether either lies the other way round
+# strongest features that are asked whether navigation is wrong, of images taken one after the other and of others
+_OF_NEXT, _OF_OTHERS = 1500, 700
 
 
 def match_batch(job: Job, batch: Sequence[PairTask], extracted: Mapping[int, Done]) -> list[tuple[int, int, Done]]:
@@ -113,14 +114,11 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
         return Made({}, {"model": "", "matches": 0, "inliers": 0})
     ranges = [range_m for range_m in (a.info["range_m"], b.info["range_m"]) if range_m]
     at = float(np.mean(ranges)) if ranges else pair.range_m
-    everything = tuple(np.arange(len(entry.arrays["feature_uv"])) for entry in (a, b))
-    near = everything if pair.poses is None else _candidates(job, pair, pair.poses, a, b, at)
-    matched = _matches(job, a, b, near)
+    matched = _matches(job, a, b) if pair.poses is None else _expected(job, pair, pair.poses, a, b, at)
     soundings = _soundings(a, carried[0]), _soundings(b, carried[1])
     found, turned, free = _estimate(job, pair.prior, matched, soundings, at), (False, False), False
     if pair.prior is not None and _weak(found, matched):
-        asked = None if pair.next else _STRONGEST
-        every = _matches(job, a, b, (everything[0][:asked], everything[1][:asked]))
+        every = _either_way(job, *(_strongest(each, _OF_NEXT if pair.next else _OF_OTHERS) for each in (a, b)))
         needed = 2 * max(len(found.inliers) if found else 0, job.parameters.match.min_inliers)
         if len(every.features) > 3 * needed:  # fewer are chance
             best, turned, free = _against_navigation(job, pair, every, needed, soundings, at)
@@ -128,7 +126,8 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
     count = len(matched.features)
     if found is None:
         return Made({}, {"model": "", "matches": count, "inliers": 0})
-    agreed = _guided(job, found, matched.features[found.inliers], a, b, at)
+    alike = _half_turned(b) if turned[0] != turned[1] else b
+    agreed = _guided(job, found, matched.features[found.inliers], a, alike, at)
     return Made(
         {
             "R": found.R_i_j,
@@ -158,19 +157,54 @@ class Matched(NamedTuple):
     features: np.ndarray
 
 
-def _matches(job: Job, a: Entry, b: Entry, index: tuple[np.ndarray, ...]) -> Matched:
-    """Matches of the features that index names in either image."""
-    of_a, of_b = (entry.arrays["feature_descriptors"][chosen] for entry, chosen in zip((a, b), index, strict=True))
-    matches = features.match(of_a, of_b, job.parameters.match.ratio)
-    numbers = np.column_stack([index[0][matches[:, 0]], index[1][matches[:, 1]]])
+def _either_way(job: Job, a: Entry, b: Entry) -> Matched:
+    """Matches as navigation has the headings, or with one of the two images the other way round: what gives more."""
+    return max((_matches(job, a, each) for each in (b, _half_turned(b))), key=lambda m: len(m.features))
+
+
+def _strongest(entry: Entry, count: int) -> Entry:
+    """The image with its strongest features only."""
+    names = "feature_uv", "feature_descriptors"
+    return entry._replace(arrays={**entry.arrays, **{name: entry.arrays[name][:count] for name in names}})
+
+
+def _half_turned(entry: Entry) -> Entry:
+    """The image with the descriptors that it has if it lies the other way round than navigation says."""
+    turned = features.half_turned(entry.arrays["feature_descriptors"])
+    return entry._replace(arrays={**entry.arrays, "feature_descriptors": turned})
+
+
+def _features(entry: Entry) -> features.Features:
+    return features.Features(entry.arrays["feature_uv"], entry.arrays["feature_descriptors"])
+
+
+def _matches(job: Job, a: Entry, b: Entry) -> Matched:
+    """Matches wherever in the two images they are."""
+    return _named(a, b, features.match(_features(a), _features(b), job.parameters.match.ratio))
+
+
+def _named(a: Entry, b: Entry, numbers: np.ndarray) -> Matched:
     uv_a, uv_b = (entry.arrays["feature_uv"][n].astype(float) for entry, n in zip((a, b), numbers.T, strict=True))
     return Matched(uv_a, uv_b, numbers)
+
+
+def _expected(job: Job, pair: PairTask, poses: Poses, a: Entry, b: Entry, range_m: float) -> Matched:
+    """Matches that lie where navigation expects them."""
+    lens = job.calibration.camera
+    margin_px = pair.margin_m / range_m * max(lens.fx, lens.fy)
+    of_a, of_b = _features(a), _features(b)
+    uv = [pairs.expected(lens, of.uv.astype(float), poses, k, 1 - k, range_m) for k, of in enumerate((of_a, of_b))]
+    seen = [np.flatnonzero(pairs.inside(lens, each, margin_px)) for each in uv]
+    part_a, part_b = (features.Features(of.uv[n], of.descriptors[n]) for of, n in zip((of_a, of_b), seen, strict=True))
+    expected = features.Expected(uv[0][seen[0]], margin_px)
+    found = features.match(part_a, part_b, job.parameters.match.ratio, expected)
+    return _named(a, b, np.column_stack([seen[0][found[:, 0]], seen[1][found[:, 1]]]))
 
 
 def _guided(job: Job, found: motion.Motion, known: np.ndarray, a: Entry, b: Entry, range_m: float) -> np.ndarray:
     """The matches (M, 2) that a motion leads to."""
     lens = job.calibration.camera
-    of_a, of_b = (features.Features(e.arrays["feature_uv"], e.arrays["feature_descriptors"]) for e in (a, b))
+    of_a, of_b = _features(a), _features(b)
     x_a, x_b = (camera.normalised(lens, side.uv.astype(float), range_m) for side in (of_a, of_b))
     focal_px = range_m / camera.ground_sample_distance(lens, range_m)
     return guided.match(of_a, of_b, x_a, x_b, known, found, focal_px)
@@ -233,16 +267,6 @@ def _soundings(entry: Entry, carried: Carried) -> tuple[np.ndarray, float]:
     parts = [lit.arrays.get("laser_X", np.zeros((0, 3))) @ step.R_i_j.T + step.t_i_j for lit, step in carried]
     variance = [float(step.covariance[3:, 3:].trace()) / 3 for _, step in carried]
     return np.concatenate(parts), float(np.sqrt(np.mean(variance)))
-
-
-def _candidates(job: Job, pair: PairTask, poses: Poses, a: Entry, b: Entry, range_m: float):
-    """Features that the other image may see too."""
-    lens = job.calibration.camera
-    seen = [
-        pairs.seen_by(lens, entry.arrays["feature_uv"].astype(float), poses, k, 1 - k, range_m, pair.margin_m)
-        for k, entry in enumerate((a, b))
-    ]
-    return np.flatnonzero(seen[0]), np.flatnonzero(seen[1])
 
 
 def link(i: int, j: int, entry: Entry) -> Link:

@@ -2,11 +2,13 @@
 
 import sys
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 
+from ..catalog.store import Store
 from ..schemas.calibration import Camera
 from ..tasks import camera, colour, frames, laser, mosaic, nodes, planar, terrain, water
 from ..tasks.frames import MapFrame
@@ -14,7 +16,7 @@ from ..tasks.grids import Grid
 from ..tasks.navigation import Poses
 from ..tasks.nodes import Lie, Shot
 from . import extract, match, solve
-from .job import Done, Job, Made, code_version, load, once, stage
+from .job import Done, Job, LostEntry, Made, code_version, load, once, stage
 from .maps import SURFACE, ground_around, paste
 from .maps_inputs import Image, MapJob, Pair, Tile, context, pose_digest, rows_of
 from .solve import Solution
@@ -23,6 +25,7 @@ from .solve import Solution
 _ALIGNED_MATCHES = 50
 LIGHTING, ALIGN, MOSAIC = "lighting", "planar-align", "mosaic"
 _VERSION = code_version(sys.modules[__name__])
+_REMEMBERED = 64  # images, of which 0.2 MB each
 
 
 def lighting(m: MapJob, images: Sequence[Image]) -> Done:
@@ -103,27 +106,26 @@ def mosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], alig
     inputs = [*_inputs(tile, solution), *(done.key for _, done in ground), aligned.key, light.key if light else ""]
 
     def make() -> Made:
-        model = _model(m.job, light)
+        model = light_model(m.job, light)
         small = [model and _thumbnail(m.job, image, solution.poses, model) for image in tile.images]
-        shots = [_shot(m.job, image, thumbnail) for image, thumbnail in zip(tile.images, small, strict=True)]
-        tone = _tone(m.job.calibration.camera, model) if model else None
+        shots = [shot(m.job, image, thumbnail) for image, thumbnail in zip(tile.images, small, strict=True)]
+        toned = tone(m.job.calibration.camera, model) if model else None
         both = _on_surface(m, tile, ground, solution.poses), _on_plane(m, tile, aligned, solution.poses)
         plans = [
-            mosaic.plan(tile.grid, place, [(shot, lies[shot.number]) for shot in shots], tone) for place, lies in both
+            mosaic.plan(tile.grid, place, [(one, lies[one.number]) for one in shots], toned) for place, lies in both
         ]
         images = {image.row: image for image in tile.images}
 
         def read(row: int, reduce: int) -> np.ndarray:
-            bgr = extract.read_verified(m.job, images[row].path, images[row].sha256, reduce)
-            return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+            return read_image(m.job, images[row], reduce)
 
         cv2.setNumThreads(1)
         ortho, flat = mosaic.compose(plans, read, times, m.job.parameters.mosaic.gamma if light else 1.0)
         arrays = {**ortho._asdict(), "planar_rgb": flat.rgb, "planar_mask": flat.mask}
-        return Made(arrays, {"pixels": int(ortho.mask.sum())})
+        return Made(arrays, {"pixels": int(ortho.mask.sum()), "painted": int(ortho.painted.sum())})
 
     parameters = [*_context(m, tile), sorted(times.items())]
-    return once(m.job, MOSAIC, _VERSION, inputs, parameters, make, ("mask", "source", "planar_mask"))
+    return once(m.job, MOSAIC, _VERSION, inputs, parameters, make, ("mask", "source", "painted", "planar_mask"))
 
 
 def _on_surface(
@@ -134,7 +136,7 @@ def _on_surface(
     elevation = np.full(around.shape, np.nan)
     for grid, done in ground:
         paste(around, elevation, grid, load(m.job, SURFACE, done.key, ("ground",)).arrays["ground"])
-    local = _affine(m.frame, tile.grid, elevation)
+    local = local_affine(m.frame, tile.grid, elevation)
     lies = {
         image.row: nodes.lie(local, poses.R_local_camera[image.row], poses.C_local[image.row]) for image in tile.images
     }
@@ -149,17 +151,25 @@ def _on_plane(m: MapJob, tile: Tile, aligned: Done, poses: Poses) -> tuple[nodes
     return nodes.flat_ground(tile.grid), lies
 
 
-def _affine(frame: MapFrame, tile: Grid, elevation: np.ndarray) -> frames.LocalAffine:
+def local_affine(frame: MapFrame, tile: Grid, elevation: np.ndarray) -> frames.LocalAffine:
     """The map around a tile's middle."""
     z = float(np.nanmean(elevation)) if np.isfinite(elevation).any() else 0.0
     west, south, east, north = tile.bounds
     return frame.affine_at(np.array([(west + east) / 2, (south + north) / 2, z]))
 
 
-def _shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
+def shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
     """An image without its pixels: which of them the laser lights, and its colours in small."""
-    entry = load(job, extract.STEP, image.key, ("line_uv",))
     lens = job.calibration.camera
+    return Shot(image.row, lens, _qualities(job.store, image.key, lens.model_dump_json()), thumbnail)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _qualities(store: Store, key: str, lens_json: str) -> np.ndarray:
+    """Which pixels of an image are how good, by the key of its extraction: tiles one after the other ask for it."""
+    entry, lens = store.get(extract.STEP, key, ("line_uv",)), Camera.model_validate_json(lens_json)
+    if entry is None:
+        raise LostEntry(f"{store.path(extract.STEP, key)} is gone or damaged; run again to make it anew")
     scale = nodes.quality_scale(lens)
     shape = -(-lens.height // scale), -(-lens.width // scale)
     erase = np.zeros(shape, bool)
@@ -168,10 +178,11 @@ def _shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
         erase[np.clip(v, 0, shape[0] - 1), np.clip(u, 0, shape[1] - 1)] = True
         line = np.argwhere(erase)[:, ::-1].astype(float)  # each pixel once
         erase = laser.mask(shape, line, entry.info["halfwidth_px"] / scale + 0.5)
-    return Shot(image.row, lens, nodes.qualities(erase, scale), thumbnail)
+    return nodes.qualities(erase, scale)
 
 
-def _model(job: Job, light: Done | None) -> water.Water | None:
+def light_model(job: Job, light: Done | None) -> water.Water | None:
+    """What lamps and water do, as `lighting` found it; None for pixels as they were taken."""
     if light is None:
         return None
     a = load(job, LIGHTING, light.key).arrays
@@ -186,11 +197,19 @@ def _thumbnail(job: Job, image: Image, poses: Poses, model: water.Water) -> np.n
     return water.without_holes(small * gain - veil)
 
 
-def _tone(lens: Camera, model: water.Water) -> mosaic.Tone:
-    def tone(u: np.ndarray, v: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def read_image(job: Job, image: Image, times: int) -> np.ndarray:
+    """An image, red green blue, so many times smaller."""
+    bgr = extract.read_verified(job, image.path, image.sha256, times)
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+
+
+def tone(lens: Camera, model: water.Water) -> mosaic.Tone:
+    """What an image's light is multiplied with, less what, by pixel and distance."""
+
+    def at(u: np.ndarray, v: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return water.tone(model, nodes.small_at(model.light, lens, u, v), range_m)
 
-    return tone
+    return at
 
 
 VERSIONS = dict.fromkeys((LIGHTING, ALIGN, MOSAIC), _VERSION)

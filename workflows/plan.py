@@ -44,14 +44,15 @@ def plan(opened: OpenedMission, parameters: Parameters) -> Plan:
     """Poses by navigation and the list of images to extract."""
     frames = opened.frames
     status, role = frames["status"].values, frames["role"].values
-    images = tuple(
-        ImageTask(k, str(frames["image"].values[k]), str(frames["sha256"].values[k]), role[k])
-        for k in range(frames.sizes["image"])
-        if not status[k]
-    )
     mount = opened.calibration.mount
     frame = _map_frame(opened)
     prior = None if opened.crs is None else _prior(frames, frame, opened, parameters)
+    rows = [k for k in range(frames.sizes["image"]) if not status[k]]
+    north = _north_deg(prior, rows)
+    images = tuple(
+        ImageTask(k, str(frames["image"].values[k]), str(frames["sha256"].values[k]), role[k], deg)
+        for k, deg in zip(rows, north, strict=True)
+    )
     altitude = frames["altitude"].values.astype(float)
     known = altitude[np.isfinite(altitude)]
     range_m = np.where(np.isfinite(altitude), altitude, np.median(known) if len(known) else ASSUMED_RANGE_M)
@@ -59,6 +60,16 @@ def plan(opened: OpenedMission, parameters: Parameters) -> Plan:
         range_m = range_m - mount.translation[2]
     R_first = navigation.first_camera_without_navigation(mount)
     return Plan(images, frame, prior, np.maximum(range_m, 0.1), R_first)
+
+
+def _north_deg(prior: NavigationPrior | None, rows: list[int]) -> list[int | None]:
+    """Where north is in each image, if the headings of all are known: descriptors must be alike in all images.
+
+    Whole degrees, so that navigation can be corrected a little without all images being extracted again.
+    """
+    if prior is None or not prior.poses.known[rows].all():
+        return [None] * len(rows)
+    return np.round(np.degrees(navigation.north_rad(prior.poses)[rows])).astype(int).tolist()
 
 
 def _map_frame(opened: OpenedMission) -> MapFrame:

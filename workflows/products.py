@@ -2,60 +2,58 @@
 
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyproj
-import rasterio
 from pyproj.crs import CompoundCRS
-from rasterio.enums import Resampling
 
-from ..catalog import meshes, metadata, netcdf, pointclouds, rasters, trajectories, vectors, versions
+from ..catalog import memory, meshes, metadata, netcdf, pointclouds, rasters, tiles3d, trajectories, vectors, versions
+from ..catalog.filesystems import Folder
 from ..catalog.mission_files import MissionFiles
 from ..catalog.missions import OpenedMission
 from ..catalog.store import digest
 from ..schemas.mission import Mission
-from ..schemas.products import MeshQuality, Quality
+from ..schemas.products import Quality
 from ..schemas.provenance import InputFile, Provenance
-from ..tasks import mesh, rotations
-from ..tasks.grids import Bounds, Grid
-from . import calibration_quality, extract, maps, mosaics, quality, report, report_figures
+from ..tasks import contours, derivatives, rotations
+from ..tasks.grids import Grid
+from . import (
+    calibration_quality,
+    extract,
+    layers,
+    maps,
+    mesh_products,
+    mosaics,
+    quality,
+    report,
+    report_figures,
+    residual_quality,
+)
 from .job import code_version, load
 from .results import Results, span, vertical_reference
 from .solve import Solution
 
-_VERSION = code_version(
-    sys.modules[__name__],
-    report_figures,
-    meshes,
-    metadata,
-    netcdf,
-    pointclouds,
-    rasters,
-    trajectories,
-    vectors,
-    mesh,
-    report,
-    quality,
-    calibration_quality,
+DECIDING = (
+    *(sys.modules[__name__], report_figures, meshes, metadata, netcdf, pointclouds, rasters, trajectories, vectors),
+    *(contours, mesh_products, tiles3d, report, quality, calibration_quality, residual_quality),
 )
-_MESH_CELLS = 2_000_000
-_NAMED_BY = ("image", "role", "time", "status", "sha256")
+VERSION = code_version(*DECIDING)
 
 
-def write(results: Results) -> tuple[Path, bool, Quality]:
+def write(results: Results) -> tuple[Folder, bool, Quality]:
     """Write the next version, unless the newest was made from the same: its folder, whether new, its figures."""
     job, mapped = results.job, results.mapped
-    keys = [done.key for _, done in (*mapped.surface.tiles, *mapped.mosaic.tiles)]
+    tiles = *mapped.surface.tiles, *mapped.terrain.layers.tiles, *mapped.mosaic.tiles
+    keys = [done.key for done in (*(done for _, done in tiles), *mapped.terrain.contours, *mapped.mesh.values())]
     keys += [done.key for done in results.posed.extracted.values()] + [results.posed.adjusted.key]
-    inputs = sorted(f"{name}:{sha}" for name, sha in results.opened.input_digests.items())
-    frames = results.opened.frames
-    inputs += [str(row) for row in zip(*(frames[name].values for name in _NAMED_BY), strict=True)]
-    made_from = digest("products", _VERSION, [*inputs, *keys], job.parameters.model_dump(mode="json"))
+    inputs = memory.inputs_digest(results.opened)
+    made_from = digest("products", VERSION, [inputs, *keys], job.parameters.model_dump(mode="json"))
     writer = versions.new_version(results.out, job.mission_id, made_from)
-    if isinstance(writer, Path):
+    if not isinstance(writer, versions.VersionWriter):
         return writer, False, Quality.model_validate_json((writer / "quality.json").read_text(encoding="utf-8"))
     with writer:
         figures = _write_all(results, writer.folder, made_from)
@@ -68,9 +66,10 @@ def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
     rows, navigation = _trajectory(results)
     trajectories.write(folder / "trajectory.csv", rows)
     _write_bathymetry(results, folder, crs_wkt)
+    _write_terrain(results, folder, crs_wkt)
     _write_mosaics(results, folder, crs_wkt)
     count = _write_soundings(results, folder, crs_wkt)
-    triangles = _write_mesh(folder, crs_wkt, results)
+    triangles = mesh_products.write(results, folder, crs_wkt)
     _write_survey(results, folder, crs_wkt, rows)
     figures = quality.figures(results, folder, rows, navigation, count, triangles)
     metadata.write_quality(folder / "quality.json", figures)
@@ -179,18 +178,36 @@ def _write_bathymetry(results: Results, folder: Path, crs_wkt: str) -> None:
     )
 
 
+def _write_terrain(results: Results, folder: Path, crs_wkt: str) -> None:
+    found, job = results.mapped.terrain.layers, results.job
+    fine, broad = layers.rings(job.parameters.terrain, results.mapped.cell_m)
+    rings = {"bpi-fine": fine, "bpi-broad": broad}
+    with ExitStack() as stack:
+        files = {}
+        for name in derivatives.LAYERS:
+            tags = {"MISSION": results.opened.mission.id}
+            if name in rings:
+                tags["RING"] = quality.ring_text(quality.ring_scale(rings[name], results.mapped.cell_m))
+            files[name] = stack.enter_context(_writer(folder, f"terrain/{name}.tif", found.grid, crs_wkt, tags))
+        for tile, done in found.tiles:
+            for name, values in load(job, layers.TERRAIN, done.key).arrays.items():
+                files[name].write(*_inner(found.grid, tile), values)
+
+
 def _write_mosaics(results: Results, folder: Path, crs_wkt: str) -> None:
     tags = {"MISSION": results.opened.mission.id}
     mosaic, job = results.mapped.mosaic, results.job
     with (
         _writer(folder, "mosaic.tif", mosaic.grid, crs_wkt, tags) as colours,
         _writer(folder, "mosaic-source.tif", mosaic.grid, crs_wkt, tags) as sources,
+        _writer(folder, "mosaic-painted.tif", mosaic.grid, crs_wkt, tags) as painted,
         _writer(folder, "mosaic-planar.tif", mosaic.grid, crs_wkt, tags) as planar,
     ):
         for tile, done in mosaic.tiles:
             arrays, place = load(job, mosaics.MOSAIC, done.key).arrays, _inner(mosaic.grid, tile)
             colours.write(*place, arrays["rgb"], arrays["mask"])
             sources.write(*place, arrays["source"])
+            painted.write(*place, arrays["painted"])
             planar.write(*place, arrays["planar_rgb"], arrays["planar_mask"])
 
 
@@ -213,40 +230,6 @@ def _write_soundings(results: Results, folder: Path, crs_wkt: str) -> int:
     return count
 
 
-def _write_mesh(folder: Path, crs_wkt: str, results: Results) -> MeshQuality:
-    """The surface, thinned to a bounded size, textured with the orthomosaic."""
-    p, grid = results.job.parameters.mesh, results.mapped.surface.grid
-    step = max(1, int(np.ceil(np.sqrt(grid.width * grid.height / _MESH_CELLS))))
-    coarse = Grid(grid.cell_m * step, 0, 0, -(-grid.width // step), -(-grid.height // step))
-    with rasterio.open(folder / "bathymetry.tif") as file:
-        z = file.read(1, out_shape=coarse.shape, masked=True, resampling=Resampling.average).astype(float)
-    with rasterio.open(folder / "mosaic.tif") as file:
-        shrink = max(1.0, max(file.width, file.height) / p.texture_px)
-        size = max(1, round(file.height / shrink)), max(1, round(file.width / shrink))
-        texture = np.moveaxis(file.read(out_shape=(3, *size), resampling=Resampling.average), 0, -1)
-        edges = file.bounds
-    # a coarse cell need not lie on whole multiples of itself in the map: it counts from the grid's corner
-    west, _, _, north = grid.bounds
-    moved = Bounds(edges.left - west, edges.bottom - north, edges.right - west, edges.top - north)
-    origin = np.array([west, north, 0.0])
-    made = mesh.surface_mesh(z.filled(np.nan), coarse, np.zeros(3), moved, p.max_triangles)
-    uv = np.column_stack([made.uv[:, 0], 1 - made.uv[:, 1]])  # images begin at the north, meshes at the south
-    comments = [f"offset {west:.3f} {north:.3f} 0.000", f"crs {crs_wkt}"]
-    colours = _sampled(texture, uv)
-    meshes.write_ply(folder / "mesh.ply", made.vertices, made.triangles, colours, comments=comments)
-    about = {"crs": crs_wkt, "offset": origin.tolist()}
-    meshes.write_glb(folder / "mesh.glb", made.vertices, made.triangles, uv, texture, about)
-    return MeshQuality(vertices=len(made.vertices), triangles=len(made.triangles))
-
-
-def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Colours (V, 3) of a texture (h, w, 3) at uv (V, 2), row 0 at v = 0."""
-    height, width = texture.shape[:2]
-    column = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
-    row = np.clip((uv[:, 1] * height).astype(int), 0, height - 1)
-    return texture[row, column]
-
-
 def _write_survey(results: Results, folder: Path, crs_wkt: str, rows: Sequence[trajectories.Row]) -> None:
     outlines = results.mapped.outlines
     footprints = [
@@ -254,16 +237,19 @@ def _write_survey(results: Results, folder: Path, crs_wkt: str, rows: Sequence[t
         for k, row in enumerate(rows)
     ]
     placed = [row for row in rows if row.pose is not None]
-    overview = rasters.read_overview(folder / "bathymetry.tif")
-    elevation = overview.values[0].astype(float)
+    parts = [
+        contours.Contours(**load(results.job, layers.CONTOURS, done.key).arrays)
+        for done in results.mapped.terrain.contours
+    ]
+    lines = contours.join(parts, results.mapped.cell_m).lines()
     vectors.write_survey(
         folder / "survey.gpkg",
         crs_wkt,
         footprints,
         np.array([row.pose.position for row in placed if row.pose]).reshape(-1, 3),
         np.array([row.time for row in placed], "datetime64[ns]"),
-        vectors.contours(overview, vectors.contour_interval(elevation)),
-        vectors.coverage(overview),
+        [vectors.Contour(elevation, line) for elevation, line in lines],
+        vectors.coverage(rasters.read_overview(folder / "bathymetry.tif")),
     )
 
 
@@ -282,6 +268,7 @@ def _provenance(results: Results, made_from: str) -> Provenance:
         inputs=dict(_inputs(results.opened)),
         parameters=resolved,
         steps=results.steps,
+        request=results.request,
     )
 
 

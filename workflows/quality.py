@@ -18,11 +18,14 @@ from ..schemas.products import (
     NavigationDifference,
     PairQuality,
     Quality,
+    RingScale,
     SoundingQuality,
     SourceShares,
+    TerrainQuality,
     TrajectoryQuality,
 )
-from . import calibration_quality
+from ..tasks.derivatives import Ring
+from . import calibration_quality, layers, residual_quality
 from .results import Results, span, vertical_reference
 
 
@@ -41,6 +44,8 @@ def figures(
     """
     opened = results.opened
     calibration = calibration_quality.measured(results)
+    solution = results.posed.solution
+    block = residual_quality.held_together(solution)
     roles = Counter(str(role) for role in opened.frames["role"].values)
     start, end = span(opened)
     return Quality(
@@ -57,13 +62,20 @@ def figures(
         soundings=_sounding_quality(results, soundings),
         calibration=calibration,
         pairs=_pair_quality(results),
-        trajectory=_trajectory_quality(rows, navigation, results.posed.solution.reprojection_px),
+        trajectory=_trajectory_quality(rows, navigation, solution.reprojection_px).model_copy(
+            update={
+                "blocks": residual_quality.sizes(rows, block),
+                "images": tuple(residual_quality.images(rows, navigation, solution, block)),
+            }
+        ),
         bathymetry=_bathymetry_quality(folder, results.mapped.cell_m),
+        terrain=_terrain_quality(results, folder),
         mosaic=_mosaic_quality(results),
         mesh=triangles,
         warnings=(
             *opened.warnings,
             *_doubts(rows, results),
+            *residual_quality.doubts(rows, block),
             *calibration_quality.doubts(calibration, calibration_quality.typical_range(results)),
         ),
     )
@@ -73,7 +85,10 @@ def _doubts(rows: Sequence[trajectories.Row], results: Results) -> Iterator[str]
     """What the figures show but a hurried reader may miss."""
     alone = sum(row.kind == "navigation" for row in rows)
     if alone:
-        yield f"{alone} of {len(rows)} images are placed by navigation alone: no match with another image holds them"
+        yield (
+            f"{alone} of {len(rows)} images are placed by navigation alone: neither matches nor crossing laser lines "
+            "hold them"
+        )
     turned = [rows[k].image for k in np.flatnonzero(results.posed.solution.turned).tolist()]
     if turned:
         names = ", ".join(turned[:6]) + (" ..." if len(turned) > 6 else "")
@@ -107,12 +122,16 @@ def _pair_quality(results: Results) -> PairQuality:
     used = {(int(i), int(j)) for i, j in results.posed.solution.pairs}
     linked = [done.info for i, j, done in results.posed.matched if (i, j) in used]
     models = Counter(info["model"] for info in linked)
+    left, names = results.posed.solution.residuals, [str(name) for name in results.opened.frames["image"].values]
     return PairQuality(
         tried=len(results.posed.matched),
         linked=len(linked),
         homography=models["homography"],
         essential=models["essential"],
         median_inliers=float(np.median([info["inliers"] for info in linked])) if linked else None,
+        crossed=0 if left is None else len(left.crossed),
+        crossover_rms_m=residual_quality.crossover_rms(results.posed.solution),
+        residuals=tuple(residual_quality.pairs(names, results.posed.solution)),
     )
 
 
@@ -159,9 +178,43 @@ def _bathymetry_quality(folder: Path, cell_m: float) -> BathymetryQuality:
     )
 
 
+def _terrain_quality(results: Results, folder: Path) -> TerrainQuality:
+    cell = results.mapped.cell_m
+    fine, broad = layers.rings(results.job.parameters.terrain, cell)
+    slope, vrm, rugosity, roughness = (
+        rasters.summarise(folder / f"terrain/{name}.tif").median for name in ("slope", "vrm", "rugosity", "roughness")
+    )
+    return TerrainQuality(
+        slope_deg=slope,
+        vrm=vrm,
+        rugosity=rugosity,
+        roughness_m=roughness,
+        bpi_fine=ring_scale(fine, cell),
+        bpi_broad=ring_scale(broad, cell),
+        contour_interval_m=results.mapped.terrain.interval_m,
+    )
+
+
+def ring_scale(ring: Ring, cell_m: float) -> RingScale:
+    """A ring in cells and in metres."""
+    inner, outer = ring
+    return RingScale(inner_cells=inner, outer_cells=outer, inner_m=inner * cell_m, outer_m=outer * cell_m)
+
+
+def ring_text(scale: RingScale) -> str:
+    """A ring's scale in words."""
+    return f"{scale.inner_cells} to {scale.outer_cells} cells, {scale.inner_m:g} to {scale.outer_m:g} m"
+
+
 def _mosaic_quality(results: Results) -> MosaicQuality:
     cell = results.mapped.mosaic_cell_m
     pixels = sum(done.info["pixels"] for _, done in results.mapped.mosaic.tiles)
     surface = sum(done.info["cells"] for _, done in results.mapped.surface.tiles) * results.mapped.cell_m**2
     area = pixels * cell**2
-    return MosaicQuality(cell_m=cell, area_m2=area, coverage_share=min(1.0, area / surface) if surface else None)
+    painted = sum(done.info["painted"] for _, done in results.mapped.mosaic.tiles)
+    return MosaicQuality(
+        cell_m=cell,
+        area_m2=area,
+        coverage_share=min(1.0, area / surface) if surface else None,
+        painted_share=painted / pixels if pixels else None,
+    )

@@ -20,8 +20,10 @@ from ..catalog import rasters, trajectories
 from ..schemas.products import PRODUCTS, NavigationDifference, Quality
 from ..schemas.provenance import Provenance
 from . import report_figures as figures
+from .quality import ring_text
 
 _REJECTED_SHOWN: Final = 200
+_WORST_SHOWN: Final = 10
 _TEMPLATE: Final = "report.html"
 _WRITTEN_LATER: Final = ("report.html", "metadata/provenance.json")
 
@@ -87,6 +89,7 @@ def write_report(
         title=quality.mission.title or quality.mission.id,
         key_figures=list(_key_figures(quality)),
         pictures=list(_pictures(root, rows, quality, navigation)),
+        worst=_worst(quality),
         rejected=rejected[:_REJECTED_SHOWN],
         rejected_count=len(rejected),
         provenance=provenance,
@@ -97,6 +100,20 @@ def write_report(
     path = root / "report.html"
     path.write_text(page, encoding="utf-8")
     return path
+
+
+def _worst(quality: Quality) -> list[tuple[str, str, str]]:
+    """What the pairs with the largest residuals are off: names, by tie points, by crossovers."""
+    found = quality.pairs.residuals if quality.pairs else ()
+    order = sorted(found, key=lambda pair: -max(pair.reprojection_px or 0, 1000 * (pair.apart_m or 0)))
+    return [
+        (
+            " – ".join(pair.images),
+            "" if pair.reprojection_px is None else f"{pair.reprojection_px:.2f} px at {pair.tie_points:,} tie points",
+            "" if pair.apart_m is None else f"{_length(pair.apart_m)} at {pair.crossovers:,} crossings",
+        )
+        for pair in order[:_WORST_SHOWN]
+    ]
 
 
 def readable_size(size: int) -> str:
@@ -133,8 +150,8 @@ def _image_figures(quality: Quality) -> Iterator[KeyFigure]:
     yield KeyFigure(
         "Images placed",
         f"{placed:,}",
-        f"{trajectory.adjusted:,} by matching with others, {trajectory.navigation_only:,} by navigation alone; "
-        f"{trajectory.rejected:,} rejected",
+        f"{trajectory.adjusted:,} by matches or crossing laser lines, {trajectory.navigation_only:,} by navigation "
+        f"alone; {trajectory.rejected:,} rejected",
     )
     if trajectory.sigma_median_m is not None:
         x, y, z = trajectory.sigma_median_m
@@ -146,6 +163,14 @@ def _image_figures(quality: Quality) -> Iterator[KeyFigure]:
     if trajectory.reprojection_rms_px is not None:
         meaning = "rms distance between where tie points are seen and where the adjusted cameras should see them"
         yield KeyFigure("Reprojection error", f"{trajectory.reprojection_rms_px:.2f} px", meaning)
+    if trajectory.blocks:
+        shown = ", ".join(f"{size:,}" for size in trajectory.blocks[:6]) + (
+            " ..." if len(trajectory.blocks) > 6 else ""
+        )
+        meaning = (
+            f"of {shown} images: matches and crossing laser lines join each, navigation alone holds them to another"
+        )
+        yield KeyFigure("Blocks of images", f"{len(trajectory.blocks):,}", meaning)
     if trajectory.navigation_minus_adjusted is not None:
         yield _difference_figure(trajectory.navigation_minus_adjusted)
 
@@ -175,6 +200,9 @@ def _sounding_figures(quality: Quality) -> Iterator[KeyFigure]:
             f"{pairs.linked:,} of {pairs.tried:,}",
             f"{pairs.homography:,} as flat ground, {pairs.essential:,} as relief{inliers}",
         )
+        if pairs.crossover_rms_m is not None:
+            meaning = f"rms distance of the laser lines of different images where they cross, {pairs.crossed:,} pairs"
+            yield KeyFigure("Crossovers", _length(pairs.crossover_rms_m), meaning)
 
 
 def _calibration_figures(quality: Quality) -> Iterator[KeyFigure]:
@@ -224,7 +252,15 @@ def _bathymetry_figures(quality: Quality) -> Iterator[KeyFigure]:
 
 
 def _other_figures(quality: Quality) -> Iterator[KeyFigure]:
-    mosaic, mesh = quality.mosaic, quality.mesh
+    mosaic, mesh, terrain = quality.mosaic, quality.mesh, quality.terrain
+    if terrain is not None and terrain.slope_deg is not None:
+        rugosity = "" if terrain.rugosity is None else f"; its surface is {terrain.rugosity:.3f} of its map"
+        yield KeyFigure("Slope", f"{terrain.slope_deg:.1f}°", f"of a typical cell{rugosity}")
+        yield KeyFigure(
+            "Position indices",
+            f"{ring_text(terrain.bpi_fine)} / {ring_text(terrain.bpi_broad)}",
+            f"rings of bpi-fine and bpi-broad; contours every {_length(terrain.contour_interval_m)}",
+        )
     if mosaic is not None:
         share = "" if mosaic.coverage_share is None else f"; covers {mosaic.coverage_share:.0%} of the mapped area"
         yield KeyFigure("Mosaic", f"{mosaic.area_m2:,.1f} m²", f"pixels of {_length(mosaic.cell_m)}{share}")
@@ -253,6 +289,7 @@ def _pictures(
     )
     yield from _mosaics(root, geographic)
     yield from _layers(root, geographic)
+    yield from _terrain(root, geographic)
     soundings = root / "soundings.laz"
     yield _picture(
         "Precision of soundings",
@@ -263,7 +300,15 @@ def _pictures(
     yield _picture(
         "Track",
         figures.track_map(rows, bathymetry, geographic),
-        "Where each image was taken. Adjusted: placed by matching with other images; navigation: by navigation alone.",
+        "Where each image was taken. Adjusted: placed by matches with other images or crossing laser lines; "
+        "navigation: by "
+        "navigation alone.",
+    )
+    yield _picture(
+        "Residuals of images and pairs",
+        figures.residuals(quality),
+        "Left: what tie points are off in each image, in order of time. Right: the same of each pair, and how far "
+        "apart the laser lines of a pair are where they cross.",
     )
     yield _picture(
         "Navigation minus adjusted",
@@ -305,6 +350,18 @@ def _layers(root: Path, geographic: bool) -> Iterator[Picture]:
         "Soundings in each cell; cells without are left white.",
         wide=False,
     )
+
+
+def _terrain(root: Path, geographic: bool) -> Iterator[Picture]:
+    shown = {
+        "slope": ("Slope", "slope (degrees)", "Steepest slope of each cell."),
+        "bpi-broad": ("Position", "height above ring (m)", "Bathymetric position index, wide ring: crests, hollows."),
+        "vrm": ("Ruggedness", "VRM", "Vector ruggedness: 0 where the ground is plane, whatever its slope."),
+    }
+    for name, (title, label, caption) in shown.items():
+        overview = _overview(root / f"terrain/{name}.tif")
+        figure = figures.quantity_map(overview, geographic, label) if overview is not None else None
+        yield _picture(title, figure, caption, wide=False)
 
 
 def _picture(title: str, figure: Figure | None, caption: str, wide: bool = True, kind: str = "png") -> Picture:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ..catalog import rasters
 from ..catalog.rasters import Overview
 from ..catalog.trajectories import Row
+from ..schemas.products import Quality
 
 Array = NDArray[np.float64]
 MAP_PX: Final = 1400
@@ -109,6 +110,21 @@ def quantity_map(
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     bar = figure.colorbar(image, ax=axes, label=label, format=plain)
     bar.ax.yaxis.set_minor_formatter(plain)
+    return figure
+
+
+def difference_map(overview: Overview, geographic: bool, label: str, scale: float = 1.0) -> Figure | None:
+    """A difference in colour: red is more, blue is less, white is none."""
+    if not overview.valid.any():
+        return None
+    values = np.asarray(overview.values[0], float) * scale
+    most = float(np.percentile(np.abs(values[overview.valid]), 98)) or 1.0
+    figure, axes = _map_axes(overview, geographic, 8.4, bar=True)
+    axes.set_facecolor("#d9d9d9")
+    image = axes.imshow(
+        values, cmap="RdBu_r", norm=Normalize(-most, most), extent=overview.extent, interpolation="nearest"
+    )
+    figure.colorbar(image, ax=axes, label=label, extend="both")
     return figure
 
 
@@ -204,6 +220,26 @@ def navigation_difference(rows: Sequence[Row], navigation: Array) -> Figure | No
     axes.xaxis.set(major_locator=locator, major_formatter=ConciseDateFormatter(locator))
     axes.set(xlabel="time (UTC)", ylabel="navigation − adjusted (m)")
     axes.legend(fontsize=8)
+    return figure
+
+
+def residuals(quality: Quality) -> Figure | None:
+    """What the adjustment left: of each image by its tie points, of each pair by tie points and by crossovers."""
+    images = quality.trajectory.images if quality.trajectory else ()
+    pairs = quality.pairs.residuals if quality.pairs else ()
+    by_image = [np.nan if one.reprojection_px is None else one.reprojection_px for one in images]
+    by_pair = [pair.reprojection_px for pair in pairs if pair.reprojection_px is not None]
+    crossed = [1000 * pair.apart_m for pair in pairs if pair.apart_m is not None]
+    if not pairs:
+        return None
+    figure = Figure(figsize=(8.4, 2.8), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    left.plot(by_image, marker=".", markersize=4, linestyle="none", color=_AXIS_COLOURS[0])
+    left.set(xlabel="image", ylabel="reprojection rms (px)", ylim=(0, None))
+    for axes, values, label in ((middle, by_pair, "reprojection rms (px)"), (right, crossed, "lines apart, rms (mm)")):
+        if values:
+            axes.hist(values, bins=30, color=_AXIS_COLOURS[2])
+        axes.set(xlabel=label, ylabel="pairs")
     return figure
 
 

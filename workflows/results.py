@@ -1,17 +1,17 @@
 """What the steps of a run came to, as the products are made from it."""
 
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pyproj
 
 from ..catalog.missions import OpenedMission
-from ..schemas.provenance import Step
+from ..schemas.provenance import Request, Step
 from ..tasks.grids import Grid
 from .job import Done, Job
 from .maps_inputs import MapJob
+from .meshing import Place
 from .plan import Plan
 from .solve import Solution
 
@@ -32,6 +32,14 @@ class Tiles(NamedTuple):
     tiles: tuple[tuple[Grid, Done], ...]
 
 
+class TerrainLayers(NamedTuple):
+    """Habitat layers, and the contours of each tile with their interval."""
+
+    layers: Tiles
+    contours: tuple[Done, ...]
+    interval_m: float
+
+
 class Mapped(NamedTuple):
     """Results of the map tiles. outlines : (n, M, 2) footprints in map coordinates."""
 
@@ -39,20 +47,23 @@ class Mapped(NamedTuple):
     cell_m: float
     mosaic_cell_m: float
     surface: Tiles
+    terrain: TerrainLayers
     mosaic: Tiles
+    mesh: dict[Place, Done]
     outlines: np.ndarray
 
 
 class Results(NamedTuple):
-    """All that products are made from."""
+    """All that products are made from. request : what was asked for, unless the next run has to look again."""
 
     job: Job
     opened: OpenedMission
     plan: Plan
-    out: Path
+    out: str
     steps: tuple[Step, ...]
     posed: Posed
     mapped: Mapped
+    request: Request | None
 
 
 def span(opened: OpenedMission) -> tuple[datetime, datetime]:

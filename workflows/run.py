@@ -1,25 +1,49 @@
 """The main job: a mission folder to maps. Images, then pairs, then poses, then map tiles, then the products."""
 
 import itertools
-import json
-import os
-from collections.abc import Sequence
-from contextlib import suppress
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
+from uuid import uuid4
 
 import numpy as np
 from dask.delayed import Delayed, delayed
 
-from ..catalog.missions import OpenedMission, open_mission
+from ..catalog import leases, memory, records
+from ..catalog.filesystems import Folder, ObjectStoreError, is_remote, place
+from ..catalog.mission_files import no_access
+from ..catalog.mission_inputs import MISSION
+from ..catalog.missions import OpenedMission
+from ..catalog.records import LastRun
 from ..catalog.store import Store
+from ..schemas.cluster import Cluster
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.products import Quality
-from ..schemas.provenance import Step
-from . import dense, extract, mapping, maps, match, mosaics, plan, products, solve
-from .executor import open_executor
-from .job import Done, Job, load, log
+from ..schemas.provenance import Request, Step
+from . import (
+    dense,
+    extract,
+    layers,
+    mapping,
+    maps,
+    maps_inputs,
+    match,
+    meshing,
+    mosaics,
+    plan,
+    products,
+    request,
+    results,
+    solve,
+)
+from .executor import Executor, open_executor
+from .footing import Footing, software
+from .job import Done, Job, LostEntry, code_version, load, log
 from .plan import Plan
 from .results import Posed, Results
 from .session import Ledger, Session, compute
@@ -35,49 +59,122 @@ class RunResult(NamedTuple):
     Attributes
     ----------
     path : the version's folder. new : False when an earlier version stands for the same inputs and parameters.
-    quality : every figure. steps : what was computed and what was reused.
+    quality : every figure. steps : what was computed and what was reused; none where nothing had to be looked at.
+    request : digest of what was asked for; None where an image could not be read, so that the next run looks again.
     """
 
-    path: Path
+    path: Folder
     new: bool
     quality: Quality
     steps: tuple[Step, ...]
+    request: str | None = None
 
 
 def run(
     mission_url: str,
-    out: Path,
+    out: str | Path,
     parameters: Parameters,
     scheduler: str | None = None,
     workers: int | None = None,
+    cluster: Cluster | None = None,
+    *,
+    leased: bool = False,
 ) -> RunResult:
     """Process a mission into OUT/<mission id>/vN.
 
-    Results of steps are kept in OUT/<mission id>/steps under their digests, so a second run, or one that was
-    stopped, computes only what is not there.
+    If the newest version is what would be made, nothing is done. Results of steps are kept in OUT/<mission id>/steps
+    under their digests, so a run that was stopped goes on, and other parameters compute only what depends on them.
+
+    Parameters
+    ----------
+    mission_url, out : folders, or URLs that fsspec reads and writes.
+    scheduler, workers, cluster : where it runs; see `executor.open_executor`.
+    leased : the caller holds the mission's lease; else one is taken, beside others that run, so that nobody prunes.
 
     Raises
     ------
     InvalidInput
-        With everything that is wrong with the mission.
+        With everything that is wrong with the mission, OUT or the cluster.
     NothingToMap
         If no image gave a sounding or a match.
     """
-    if Path(out).exists() and not Path(out).is_dir():
+    out, mission_url = _absolute(out), _absolute(mission_url)
+    if not is_remote(out) and Path(out).exists() and not Path(out).is_dir():
         remedy = "Give -o a folder, which need not exist."
-        raise InvalidInput([Problem(str(out), None, "", "a file", "a folder", remedy)])
-    opened = _open(mission_url, out)
-    store = Store(str(Path(out).resolve() / opened.mission.id / "steps"))
-    url = mission_url if "://" in mission_url else str(Path(mission_url).resolve())
-    job = Job(url, opened.mission.id, store, opened.calibration, parameters)
-    log.info("mission=%s step=open images=%d", opened.mission.id, opened.frames.sizes["image"])
-    with open_executor(scheduler, workers) as executor:
-        state = Session(job, opened, plan.plan(opened, parameters), executor, Ledger())
-        posed = poses(state)
-        mapped = mapping.map_tiles(state, posed)
+        raise InvalidInput([Problem(out, None, "", "a file", "a folder", remedy)])
+    started = time.monotonic()
+    with _reaching(out):
+        known = memory.recall(mission_url, out)
+    opened = memory.open_known(mission_url, out, known)
+    mission_id = opened.mission.id
+    log.info("mission=%s step=%s images=%d", mission_id, "open", opened.frames.sizes["image"])
+    asked = request.ask(memory.inputs_digest(opened), parameters, CODE)
+    with _reaching(out):
+        newest = request.standing(out, mission_id, asked)
+    if newest is not None:
+        quality = Quality.model_validate_json((newest.path / "quality.json").read_text(encoding="utf-8"))
+        return RunResult(newest.path, False, quality, ())
+    store = Store(f"{out}/{mission_id}/steps")
+    with (
+        nullcontext() if leased else leases.take(out, mission_id, shared=True),
+        _footing(store, opened, out) as footing,
+        open_executor(scheduler, workers, cluster) as executor,
+    ):
+        job = Job(mission_url, mission_id, store, opened.calibration, parameters, footing)
+        executor.check(job)
+        result = _until_whole(job, opened, executor, asked, out)
+    ended, seconds = datetime.now(UTC).isoformat(timespec="seconds"), round(time.monotonic() - started, 1)
+    last = LastRun("done", result.request, int(result.path.name[1:]), ended, seconds)
+    records.write_last_run(out, mission_id, last)
+    return result
+
+
+def _until_whole(job: Job, opened: OpenedMission, executor: Executor, asked: Request, out: str) -> RunResult:
+    """Go over the steps, again where a stored result turns out to be damaged, which makes it anew."""
+    made, lost = plan.plan(opened, job.parameters), set()
+    while True:
+        try:
+            return _process(Session(job, opened, made, executor, Ledger(), uuid4().hex[:8]), asked, out)
+        except LostEntry as error:
+            if str(error) in lost:  # made anew and damaged again: the disk is to blame
+                raise
+            lost.add(str(error))
+            log.warning("mission=%s step=%s %s", job.mission_id, "repair", error)
+
+
+def _process(state: Session, asked: Request, out: str) -> RunResult:
+    posed = poses(state)
+    mapped = mapping.map_tiles(state, posed)
     steps = state.ledger.steps(_VERSIONS)
-    path, new, quality = products.write(Results(job, opened, state.plan, Path(out), steps, posed, mapped))
-    return RunResult(path, new, quality, steps)
+    remembered = asked if all(done.key for done in posed.extracted.values()) else None
+    made = Results(state.job, state.opened, state.plan, out, steps, posed, mapped, remembered)
+    path, new, quality = products.write(made)
+    return RunResult(path, new, quality, steps, remembered.digest if remembered else None)
+
+
+def _absolute(url: str | Path) -> str:
+    return str(url).rstrip("/") if is_remote(url) else str(place(url).resolve())
+
+
+@contextmanager
+def _footing(store: Store, opened: OpenedMission, out: str) -> Iterator[Footing]:
+    """The run's mark in the store, by which workers tell that they see it; leftovers of dead runs are removed."""
+    with _reaching(out):
+        store.clean()
+        mark = store.mark()
+    try:
+        yield Footing(software(), opened.input_digests[MISSION], mark)
+    finally:
+        with suppress(OSError):
+            store.unmark(mark)
+
+
+@contextmanager
+def _reaching(out: str) -> Iterator[None]:
+    try:
+        yield
+    except (PermissionError, FileNotFoundError, ObjectStoreError) as error:
+        raise InvalidInput([no_access(out, error, "a folder that can be written")]) from error
 
 
 _VERSIONS = {
@@ -86,24 +183,18 @@ _VERSIONS = {
     solve.STEP: solve.VERSION,
     **dense.VERSIONS,
     **maps.VERSIONS,
+    **layers.VERSIONS,
     **mosaics.VERSIONS,
+    **meshing.VERSIONS,
 }
-
-
-def _open(mission_url: str, out: Path) -> OpenedMission:
-    """Open a mission, remembering the images' digests between runs."""
-    memory = Path(out) / ".image-digests.json"
-    known: dict[str, Any] = {}
-    with suppress(OSError, ValueError):
-        known = json.loads(memory.read_text())
-    before = len(known)
-    opened = open_mission(mission_url, known)
-    if len(known) != before:
-        memory.parent.mkdir(parents=True, exist_ok=True)
-        temporary = memory.with_name(f"{memory.name}.{os.getpid()}")
-        temporary.write_text(json.dumps(known))
-        temporary.replace(memory)
-    return opened
+DECIDING = (sys.modules[__name__], plan, mapping, maps_inputs, results)
+# all that decides what a request comes to
+CODE = {
+    **_VERSIONS,
+    "products": products.VERSION,
+    "opening": request.OPENING,
+    "workflow": code_version(*DECIDING),
+}
 
 
 def poses(state: Session) -> Posed:
@@ -113,7 +204,7 @@ def poses(state: Session) -> Posed:
         state.ledger.begin(step)
     wanted = plan.first_pairs(made, state.opened, job.parameters)
     extracts = [
-        delayed(extract.extract_batch)(job, batch, dask_key_name=f"extract-{k}")
+        delayed(extract.extract_batch)(job, batch, dask_key_name=state.key("extract", k))
         for k, batch in enumerate(plan.batches(made.images, _IMAGES_A_BATCH))
     ]
     batch_of = {image.row: k // _IMAGES_A_BATCH for k, image in enumerate(made.images)}
@@ -121,6 +212,9 @@ def poses(state: Session) -> Posed:
     last = _adjust_task(state, matches, extracts, "adjust")
     *parts, adjusted = compute(state, "poses", [*extracts, *matches, last])
     extracted = _by_row(made, parts[: len(extracts)])
+    for image in made.images:
+        if status := extracted[image.row].info["status"]:
+            log.warning("mission=%s step=%s image=%s %s", job.mission_id, extract.STEP, image.path, status)
     matched = [pair for part in parts[len(extracts) :] for pair in part]
     adjustments = [adjusted]
     if made.prior is None:
@@ -168,7 +262,7 @@ def _match_tasks(
             [i.row for i in state.plan.images[n * _IMAGES_A_BATCH : (n + 1) * _IMAGES_A_BATCH]] for n in needed
         ]
         chosen = [extracts[n] for n in needed]
-        tasks.append(delayed(_match_batch)(state.job, batch, first_rows, chosen, dask_key_name=f"{name}-{k}"))
+        tasks.append(delayed(_match_batch)(state.job, batch, first_rows, chosen, dask_key_name=state.key(name, k)))
     return tasks
 
 
@@ -185,7 +279,7 @@ def _adjust_task(state: Session, matches: Sequence[Any], extracts: Sequence[Any]
     count, made = state.opened.frames.sizes["image"], state.plan
     rows = [image.row for image in made.images]
     given = (count, rows, list(matches), list(extracts), made.prior, made.R_first)
-    return delayed(_adjust)(state.job, *given, dask_key_name=name)
+    return delayed(_adjust)(state.job, *given, dask_key_name=state.key(name))
 
 
 def _adjust(

@@ -44,13 +44,18 @@ class Ledger:
 
 
 class Session(NamedTuple):
-    """A run under way."""
+    """A run under way; its token is in the names of its tasks, so that runs on one cluster do not share them."""
 
     job: Job
     opened: OpenedMission
     plan: Plan
     executor: Executor
     ledger: Ledger
+    token: str = ""
+
+    def key(self, name: str, number: int = 0) -> str:
+        """The name of a task for Dask, which computes it in this order."""
+        return f"{name}-{self.token}-{number:06d}"
 
 
 def compute(state: Session, step: str, tasks: Sequence[Delayed]) -> list[Any]:

@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..catalog.store import Entry
-from ..tasks import adjust, bundle, tracks
+from ..tasks import adjust, bundle, crossovers, tracks
 from ..tasks.adjust import Adjusted
 from ..tasks.navigation import NavigationPrior, Poses
+from ..tasks.residuals import Residuals
 from . import extract, match
 from .job import Done, Job, Made, array_digest, code_version, load, once, stage
 
@@ -22,7 +23,7 @@ class Solution(NamedTuple):
 
     Attributes
     ----------
-    poses, sigma_m, sigma_tilt_rad, status, turned, reprojection_px : see `tasks.adjust.Adjusted`.
+    poses, sigma_m, sigma_tilt_rad, status, turned, reprojection_px, residuals : see `tasks.adjust.Adjusted`.
     pairs : (P, 2) rows of the linked pairs that were used.
     """
 
@@ -33,6 +34,7 @@ class Solution(NamedTuple):
     pairs: np.ndarray
     turned: np.ndarray
     reprojection_px: float | None
+    residuals: Residuals | None
 
 
 def adjust_all(
@@ -70,6 +72,8 @@ def adjust_all(
             "pairs": np.array([[i, j] for i, j, _ in used], int).reshape(-1, 2),
             "turned": found.turned,
         }
+        if found.residuals is not None:
+            arrays |= {f"left_{name}": values for name, values in found.residuals._asdict().items()}
         return Made(arrays, {"status": found.status, "reprojection_px": found.reprojection_px})
 
     return once(job, STEP, VERSION, [str(count), *inputs], parameters, make)
@@ -84,8 +88,10 @@ def _bundle(
 ) -> Adjusted:
     camera, p = job.calibration.camera, job.parameters.adjust
     sights = tracks.thin(_sights(job, used), (camera.height, camera.width), p.tie_cells, p.tie_points_per_cell)
-    soundings = {row: load(job, extract.STEP, done.key, ("laser_X",)).arrays["laser_X"] for row, done in lit.items()}
-    return bundle.adjust(camera, chained, sights, soundings, prior, p)
+    arrays = {row: load(job, extract.STEP, done.key, ("laser_X", "laser_arm")).arrays for row, done in lit.items()}
+    soundings = {row: own["laser_X"] for row, own in arrays.items()}
+    lines = crossovers.lines({row: (own["laser_X"], own["laser_arm"]) for row, own in arrays.items()})
+    return bundle.adjust(camera, chained, sights, soundings, lines, prior, p)
 
 
 def _sights(job: Job, used: Sequence[tuple[int, int, Done]]) -> tracks.Sights:
@@ -101,6 +107,7 @@ def solution(entry: Entry) -> Solution:
     arrays = entry.arrays
     poses = Poses(arrays["R"], arrays["C"])
     status, turned = entry.info["status"], arrays["turned"]
+    left = [arrays[f"left_{name}"] for name in Residuals._fields if f"left_{name}" in arrays]
     return Solution(
         poses,
         arrays["sigma_m"],
@@ -109,4 +116,5 @@ def solution(entry: Entry) -> Solution:
         arrays["pairs"],
         turned,
         entry.info["reprojection_px"],
+        Residuals(*left) if left else None,
     )

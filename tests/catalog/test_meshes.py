@@ -1,11 +1,13 @@
 """Meshes, read back with trimesh."""
 
+import io
 import json
 import struct
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from seamosaic.catalog import meshes
 
 RED, GREEN, BLUE, WHITE = (220, 30, 30), (30, 200, 30), (30, 30, 220), (240, 240, 240)
@@ -32,6 +34,19 @@ def texture_coordinates(vertices):
     return np.column_stack([vertices[:, 0] / EAST, 1 - vertices[:, 1] / NORTH])
 
 
+def jpeg(texture):
+    stream = io.BytesIO()
+    Image.fromarray(texture).save(stream, "JPEG", quality=90)
+    return stream.getvalue()
+
+
+def part(n=21, textured=True, east=0.0):
+    vertices, triangles = surface(n)
+    normals = np.tile(np.array([0, -0.25, 1]) / np.hypot(1, 0.25), (len(vertices), 1))
+    picture_ = jpeg(picture()) if textured else None
+    return meshes.Part(vertices + [east, 0, 0], normals, triangles, texture_coordinates(vertices), picture_)
+
+
 def load(path):
     scene = trimesh.load(path, process=False)
     (mesh,) = scene.geometry.values()
@@ -40,7 +55,7 @@ def load(path):
 
 def test_glb_is_y_up_and_of_the_right_size(tmp_path):
     vertices, triangles = surface()
-    meshes.write_glb(tmp_path / "mesh.glb", vertices, triangles)
+    meshes.write_glb(tmp_path / "mesh.glb", [part(textured=False)])
     mesh = load(tmp_path / "mesh.glb")
     np.testing.assert_allclose(mesh.vertices[:, 0], vertices[:, 0], atol=1e-6)  # x is east
     np.testing.assert_allclose(mesh.vertices[:, 1], vertices[:, 2], atol=1e-6)  # y is up
@@ -57,8 +72,7 @@ def test_glb_is_y_up_and_of_the_right_size(tmp_path):
     ("east", "north", "colour"), [(0.2, 0.8, RED), (0.8, 0.8, GREEN), (0.2, 0.2, BLUE), (0.8, 0.2, WHITE)]
 )
 def test_texture_is_the_right_way_up(tmp_path, east, north, colour):
-    vertices, triangles = surface()
-    meshes.write_glb(tmp_path / "mesh.glb", vertices, triangles, texture_coordinates(vertices), picture())
+    meshes.write_glb(tmp_path / "mesh.glb", [part()])
     mesh = load(tmp_path / "mesh.glb")
     place = [east * EAST, mesh.vertices[:, 1].mean(), -north * NORTH]
     nearest = np.argmin(np.linalg.norm(np.delete(mesh.vertices - place, 1, axis=1), axis=1))
@@ -67,9 +81,8 @@ def test_texture_is_the_right_way_up(tmp_path, east, north, colour):
 
 
 def test_glb_metadata_and_texture_format(tmp_path):
-    vertices, triangles = surface(5)
     extras = {"crs": "EPSG:32631", "offset": [5e5, 4.7e6, -20.0]}
-    meshes.write_glb(tmp_path / "m.glb", vertices, triangles, texture_coordinates(vertices), picture(), extras)
+    meshes.write_glb(tmp_path / "m.glb", [part(5)], extras)
     data = (tmp_path / "m.glb").read_bytes()
     magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
     assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
@@ -79,13 +92,15 @@ def test_glb_metadata_and_texture_format(tmp_path):
     assert load(tmp_path / "m.glb").visual.material.baseColorTexture.size == (256, 128)
 
 
-def test_glb_of_the_default_size_stays_below_50_mb(tmp_path):
-    """400 000 triangles and a 4096-pixel texture of coarse noise."""
-    vertices, triangles = surface(448)
-    noise = np.random.default_rng(0).integers(0, 255, (256, 256, 3), np.uint8)
-    texture = np.kron(noise, np.ones((16, 16, 1), np.uint8))
-    meshes.write_glb(tmp_path / "m.glb", vertices, triangles, texture_coordinates(vertices), texture)
-    assert 5e6 < (tmp_path / "m.glb").stat().st_size < 50e6
+def test_parts_have_their_own_textures_and_large_ones_longer_indices(tmp_path):
+    parts = [part(5), part(260, textured=False, east=4.0), part(7, east=8.0)]
+    meshes.write_glb(tmp_path / "m.glb", parts)
+    scene = trimesh.load(tmp_path / "m.glb", process=False)
+    found = sorted(scene.geometry.values(), key=lambda mesh: mesh.bounds[0, 0])
+    for mesh, given in zip(found, parts, strict=True):
+        np.testing.assert_array_equal(mesh.faces, given.triangles)
+        np.testing.assert_allclose(mesh.vertices[:, 0], given.vertices[:, 0], atol=1e-6)
+        assert (mesh.visual.material.baseColorTexture is None) == (given.texture is None)
 
 
 def test_ply_keeps_axes_colours_and_comments(tmp_path):
@@ -113,13 +128,7 @@ def test_ply_texture_coordinates_have_t_up(tmp_path):
 
 def test_an_empty_surface_is_a_readable_file(tmp_path):
     nothing, none = np.zeros((0, 3)), np.zeros((0, 3), int)
-    meshes.write_glb(tmp_path / "m.glb", nothing, none)
+    meshes.write_glb(tmp_path / "m.glb", [meshes.Part(nothing, nothing, none, nothing[:, :2])])
     meshes.write_ply(tmp_path / "m.ply", nothing, none)
     assert trimesh.load(tmp_path / "m.glb").is_empty
     assert trimesh.load(tmp_path / "m.ply").is_empty
-
-
-def test_a_texture_without_coordinates_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="texture coordinates"):
-        meshes.write_glb(tmp_path / "m.glb", *surface(3), texture_rgb=picture())
-    assert not list(tmp_path.iterdir())

@@ -56,7 +56,8 @@ def test_every_product_is_a_strictly_valid_cog(tmp_path, name):
         if not layer.mask:
             np.testing.assert_array_equal(file.read(), ramp(name))
             assert float(file.tags(1)["STATISTICS_MAXIMUM"]) == pytest.approx(ramp(name).max(), rel=1e-5)
-    assert [entry.name for entry in tmp_path.iterdir()] == [name], "a temporary or side file is left"
+    files = [entry.relative_to(tmp_path).as_posix() for entry in tmp_path.rglob("*") if entry.is_file()]
+    assert files == [name], "a temporary or side file is left"
 
 
 def test_formats_are_those_of_the_public_interface():

@@ -1,6 +1,11 @@
+import socket
+import subprocess
+import sys
+
 import fsspec
 import numpy as np
 import pytest
+from seamosaic.catalog.filesystems import connect
 from seamosaic.catalog.store import Store, digest
 
 ARRAYS = {"points": np.arange(12.0).reshape(4, 3), "arm": np.array([0, 1, 1, 0], np.uint8)}
@@ -60,6 +65,42 @@ def test_a_damaged_result_counts_as_absent(tmp_path):
     assert store.info("extract", "ab12") is None
     store.put("extract", "ab12", ARRAYS, {"count": 4})
     assert store.info("extract", "ab12") == {"count": 4}
+
+
+def test_no_single_wrong_byte_is_taken_for_a_result(tmp_path):
+    store, path = Store(str(tmp_path)), tmp_path / "extract" / "ab" / "ab12.npz"
+    store.put("extract", "ab12", ARRAYS, {"count": 4}, ["arm"])
+    content = path.read_bytes()
+    damaged = 0
+    for place in range(len(content)):
+        wrong = content[place] ^ (0x80 if place % 2 else 0x01)
+        path.write_bytes(content[:place] + bytes([wrong]) + content[place + 1 :])
+        for entry in (store.get("extract", "ab12"), store.get("extract", "ab12", ["points", "arm"])):
+            damaged += entry is None
+            if entry is not None:  # a time of day, or another field that nobody reads
+                assert entry.info == {"count": 4}
+                assert set(entry.arrays) == set(ARRAYS)
+                for name, values in ARRAYS.items():
+                    np.testing.assert_array_equal(entry.arrays[name], values)
+        assert store.info("extract", "ab12") in (None, {"count": 4})
+    assert damaged > len(content)
+
+
+def test_what_dead_runs_left_is_removed_and_a_mark_is_seen(tmp_path):
+    for url in (str(tmp_path / "a"), "memory://marks"):
+        store = Store(url)
+        store.clean()  # there is nothing yet
+        mark = store.mark()
+        dead = subprocess.Popen([sys.executable, "-c", ""])
+        dead.wait()
+        gone = f"{socket.gethostname()}-{dead.pid}-0123abcd"
+        fs, folder = connect(f"{url}/.tmp")
+        fs.pipe_file(f"{folder}/{gone}", b"half")
+        store.clean()
+        assert (store.is_marked(mark), fs.exists(f"{folder}/{gone}")) == (True, False)
+        assert not Store(f"{url}-other").is_marked(mark)
+        store.unmark(mark)
+        assert not store.is_marked(mark)
 
 
 def test_nothing_half_written_stays(tmp_path):

@@ -31,7 +31,9 @@ def survey(path, crs=COMPOUND):
         vectors.Footprint(np.zeros((0, 2)), "images/V_2.jpg", TIMES[1], "rejected: truncated"),
     ]
     track = np.array([[LEFT, TOP, -17.0], [LEFT + 1, TOP + 2, -17.5]])
-    lines, coverage = vectors.contours(cone(), 0.1), vectors.coverage(cone())
+    angle = np.linspace(0, 2 * np.pi, 40)
+    circle = np.column_stack([LEFT + 1 + 0.5 * np.cos(angle), TOP - 0.8 + 0.5 * np.sin(angle)])
+    lines, coverage = [vectors.Contour(-2.5, circle), vectors.Contour(-2.4, circle + 0.1)], vectors.coverage(cone())
     vectors.write_survey(path, crs, footprints, track, TIMES, lines, coverage)
     return path
 
@@ -86,27 +88,6 @@ def test_a_track_of_one_image_is_no_line(tmp_path):
     place = np.array([[1.0, 2.0]])
     vectors.write_survey(tmp_path / "s.gpkg", COMPOUND, [], place, TIMES[:1], [], shapely.MultiPolygon())
     assert len(read(tmp_path / "s.gpkg", "track")[0]) == 0
-
-
-def test_contours_lie_on_their_elevation():
-    """On the cone a contour is a circle: 2 m of radius for each metre of height."""
-    lines = vectors.contours(cone(), 0.1)
-    assert {round(contour.elevation, 3) for contour in lines} == {-2.9, -2.8, -2.7, -2.6, -2.5, -2.4}
-    for elevation, line in lines:
-        radius = np.hypot(*(line - [LEFT + 1, TOP - 0.8]).T)
-        np.testing.assert_allclose(radius, 2 * (elevation + 3), atol=0.002)
-        assert line[:, 0].min() > LEFT + 5 * CELL  # none through the empty part
-
-
-@pytest.mark.parametrize("elevation", [np.full((9, 9), np.nan), np.zeros((1, 9)), np.full((9, 9), -3.0)])
-def test_nothing_to_contour(elevation):
-    overview = Overview(elevation[None], np.isfinite(elevation), CELL, CELL, LEFT, TOP)
-    assert vectors.contours(overview, 0.1) == []
-
-
-@pytest.mark.parametrize(("span", "interval"), [(0.0, 0.01), (1.2, 0.1), (3.0, 0.2), (6.5, 0.5), (120, 10)])
-def test_interval_is_round(span, interval):
-    assert vectors.contour_interval(np.linspace(-span, 0, 100_001) / 0.98) == pytest.approx(interval)
 
 
 def test_coverage_is_north_up_and_keeps_holes():

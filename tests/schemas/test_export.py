@@ -4,6 +4,7 @@ from typing import Any
 import pytest
 import yaml
 from seamosaic.schemas.calibration import Calibration
+from seamosaic.schemas.cluster import Cluster
 from seamosaic.schemas.export import FOLDER, MODELS, export, schema_text
 from seamosaic.schemas.mission import Mission
 from seamosaic.schemas.parameters import Parameters
@@ -52,6 +53,15 @@ laser:
 mount: {translation: [0.35, 0.12, 0.25], rotation: [0.4, -0.6, 0.5]}
 """
 
+CLUSTER = """\
+kind: pbs
+adapt: {min: 1, max: 40}
+cores: 8
+memory: 32 GiB
+walltime: '02:30:00'
+setup: [module load python]
+"""
+
 EXAMPLES: list[tuple[str, type, str]] = [
     ("mission", Mission, MISSION),
     ("mission", Mission, MISSION.replace("filename, pattern: '%Y%m%dT%H%M%S.%fZ'", "exif")),
@@ -62,6 +72,7 @@ EXAMPLES: list[tuple[str, type, str]] = [
         Calibration,
         CALIBRATION[: CALIBRATION.index("  planes")] + "  planes: {baseline: 1.2, angle: 25, roll: 45}\n",
     ),
+    ("cluster", Cluster, CLUSTER),
     ("parameters", Parameters, "grid: {cell_m: 0.05}\nmosaic: {cell_m: auto}\n"),
 ]
 

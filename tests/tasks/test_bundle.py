@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from seamosaic.schemas.calibration import Camera, Port
 from seamosaic.schemas.parameters import AdjustParameters
-from seamosaic.tasks import bundle, tracks
+from seamosaic.tasks import bundle, crossovers, laser_ranges, tracks
 from seamosaic.tasks.adjust import Adjusted
 from seamosaic.tasks.camera import project
 from seamosaic.tasks.navigation import NavigationPrior, Poses
@@ -19,6 +19,7 @@ WINDOW = LENS.model_copy(
     update={"model": "flat-port", "fx": 1120.0, "fy": 1120.0, "port": Port(distance=0.04, thickness=0.01)}
 )
 P = AdjustParameters()
+NO_LINES = crossovers.lines({})
 
 
 def _survey():
@@ -78,7 +79,7 @@ def _run(lens=LENS, wrong=0.0, laser=True, seed=0):
     navigation = _navigation(poses, rng)
     sights = tracks.thin(tracks.join(_matches(lens, points, poses, rng, wrong)), (912, 1216), P.tie_cells, 2)
     soundings = {k: scenes.cross(0.15, poses, k, rng) for k in range(18)} if laser else {}
-    found = bundle.adjust(lens, _chained(navigation.poses), sights, soundings, navigation, P)
+    found = bundle.adjust(lens, _chained(navigation.poses), sights, soundings, NO_LINES, navigation, P)
     return poses, navigation, found
 
 
@@ -113,7 +114,7 @@ def test_the_stated_sigmas_are_those_of_navigation_shared_by_all():
 def test_wrong_matches_are_left_out_and_the_noise_is_measured():
     rng, poses, points = np.random.default_rng(2), _survey(), scenes.seabed(0.15, count=20_000)
     sights = tracks.join(_matches(LENS, points, poses, rng, wrong=0.1))
-    found = bundle.refine(LENS, poses, sights, {}, _navigation(poses, rng), P)
+    found = bundle.refine(LENS, poses, sights, {}, NO_LINES, _navigation(poses, rng), P)
     assert 0.15 < found.sigma_px < 0.36
     left = found.block.sights.image.size / sights.image.size
     assert 0.6 < left < 0.99
@@ -123,7 +124,7 @@ def test_wrong_matches_are_left_out_and_the_noise_is_measured():
 def test_without_tie_points_the_start_stands():
     poses = _survey()
     start = _chained(poses)
-    assert bundle.adjust(LENS, start, tracks.join([]), {}, None, P) is start
+    assert bundle.adjust(LENS, start, tracks.join([]), {}, NO_LINES, None, P) is start
 
 
 def test_without_navigation_the_first_image_is_the_datum():
@@ -131,10 +132,24 @@ def test_without_navigation_the_first_image_is_the_datum():
     moved = Poses(poses.R_local_camera, poses.C_local + rng.normal(0, 0.01, poses.C_local.shape))
     sights = tracks.join(_matches(LENS, points, poses, rng))
     soundings = {k: scenes.cross(0.15, poses, k, rng) for k in range(18)}
-    found = bundle.adjust(LENS, _chained(moved), sights, soundings, None, P)
+    found = bundle.adjust(LENS, _chained(moved), sights, soundings, NO_LINES, None, P)
     np.testing.assert_allclose(found.poses.C_local[0], moved.C_local[0], atol=1e-4)
     assert 1e-4 < _rms(found.poses.C_local, poses.C_local) < 0.004
     assert found.sigma_m[0].max() < 1e-4 < found.sigma_m[-1].max() < 0.02
+
+
+def test_without_navigation_tie_points_must_join_all_and_ranges_give_the_scale():
+    rng, poses, points = np.random.default_rng(5), _survey(), scenes.seabed(0.15, count=20_000)
+    sights, known = tracks.join(_matches(LENS, points, poses, rng)), np.ones(18, bool)
+    under = points[np.linalg.norm(points[:, :2] - poses.C_local[0, :2], axis=1) < 0.6]
+    ranges = laser_ranges.measure(poses, under, {0: scenes.cross(0.15, poses, 0, rng)}, 10)
+    assert bundle.determined(known, sights, ranges)
+    assert not bundle.determined(known, sights, ranges.take(np.zeros(len(ranges.image), bool)))
+    halves = sights.image < 9
+    apart = sights._replace(track=np.unique(sights.track * 2 + halves, return_inverse=True)[1])
+    assert not bundle.determined(known, apart, ranges)
+    assert not bundle.determined(known, sights.take(sights.image != 17), ranges)
+    assert bundle.determined(np.arange(18) != 17, sights.take(sights.image != 17), ranges)
 
 
 def test_what_nothing_holds_leaves_the_start():
@@ -142,4 +157,4 @@ def test_what_nothing_holds_leaves_the_start():
     sights = tracks.join(_matches(LENS, points, poses, rng))
     alone = sights.take(sights.image != 17)
     start = _chained(poses)
-    assert bundle.adjust(LENS, start, alone, {}, None, P) is start
+    assert bundle.adjust(LENS, start, alone, {}, NO_LINES, None, P) is start

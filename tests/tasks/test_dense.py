@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from seamosaic.schemas.calibration import Camera
-from seamosaic.tasks import dense
+from seamosaic.tasks import dense, dense_refine
 from seamosaic.tasks.camera import rays
 
 from tests.tasks import scenes
@@ -50,8 +50,8 @@ def _match(lens, poses, erase=None, spoil=None, scale=1):
         hidden = np.zeros(grey.shape, bool) if erase is None else erase
         sights.append(dense.sight(lens, made, poses.R_local_camera[k], k == 1))
         warped.append(dense.warp(made, sights[k], grey, hidden, scale))
-    found = dense.disparity(made, warped[0], warped[1])
-    return made, found, dense.points(made, found, sights[0], sights[1])
+    found = dense_refine.refine(dense.disparity(made, warped[0], warped[1]), warped[0], warped[1])
+    return made, found.disparity, dense.points(made, found, sights[0], sights[1])
 
 
 @pytest.mark.parametrize("model", LENSES)
@@ -62,10 +62,10 @@ def test_points_lie_on_the_seabed(model, second):
     X = relief.X_local
     error = X[:, 2] - scenes.height(RELIEF, X[:, 0], X[:, 1])
     assert np.isfinite(found).sum() > 60_000
-    assert 0.01 < np.median(np.abs(error / relief.metres_per_px)) < 0.25
+    assert 0.01 < np.median(np.abs(error / relief.metres_per_px)) < 0.06
     # behind a flat port a pinhole would be off by centimetres
-    assert abs(np.median(error)) < 0.0015
-    assert np.quantile(np.abs(error), 0.95) < 0.006
+    assert abs(np.median(error)) < 0.0004
+    assert np.quantile(np.abs(error), 0.95) < 0.004
 
 
 def test_the_laser_and_plain_or_burnt_ground_are_left_out():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import rasterio
 from seamosaic.tasks import derivatives
-from seamosaic.tasks.derivatives import benthic_position, curvatures
+from seamosaic.tasks.derivatives import Ring, benthic_position, curvatures
 
 CELL = 0.02
 
@@ -84,10 +84,10 @@ def test_level_ground_has_no_aspect_and_nothing_else():
 def test_curvatures_of_a_dome_and_of_a_channel():
     y, x = (np.mgrid[-30:31, -30:31] * CELL)[:, ::-1]
     inner = (slice(1, -1), slice(1, -1))
-    # on a paraboloid z = -a r^2 / 2 both second derivatives are -a: it steepens downhill and flow diverges
+    # on a paraboloid z = -a r^2 / 2 both second derivatives are -a: convex down the slope and across it
     profile, plan = curvatures(-0.8 * (x**2 + y**2) / 2, CELL)
     away = np.hypot(x, y)[inner] > 0.05
-    assert np.allclose(profile[inner][away], -0.8)
+    assert np.allclose(profile[inner][away], 0.8)
     assert np.allclose(plan[inner][away], 0.8)
     profile, plan = curvatures(0.5 * y + 0.6 * x**2 / 2, CELL)  # down the middle of a channel
     assert np.allclose(plan[1:-1, 30], -0.6)
@@ -106,34 +106,43 @@ def test_a_slope_is_no_rougher_than_level_ground_but_larger():
 def test_benthic_position_tells_crests_from_hollows_at_its_scale():
     y, x = np.mgrid[:80, :80] * CELL
     z = 0.05 * np.cos(2 * np.pi * x / 0.8)
-    found = benthic_position(z, 3, 20)
+    found = benthic_position(z, Ring(3, 20))
     assert (found[30:50, 40] > 0.02).all()
     assert (found[30:50, 20] < -0.02).all()
     assert np.isnan(found[0, 0])
     # a straight slope has none
-    assert np.abs(benthic_position(0.3 * x - y, 2, 10)[12:-12, 12:-12]).max() < 1e-12
+    assert np.abs(benthic_position(0.3 * x - y, Ring(2, 10))[12:-12, 12:-12]).max() < 1e-7
+
+
+@pytest.mark.parametrize("ring", [Ring(0, 1), Ring(1, 5), Ring(5, 25), Ring(7, 7)])
+def test_benthic_position_is_the_mean_of_its_ring_and_no_other(ring):
+    z, (inner, outer) = _seabed(), ring
+    found = benthic_position(z, ring)
+    y, x = np.mgrid[: z.shape[0], : z.shape[1]]
+    for row, column in ((45, 60), (25, 36), (5, 5), (70, 4), (0, 50)):
+        away2 = (y - row) ** 2 + (x - column) ** 2
+        within = (away2 >= inner**2) & (away2 <= outer**2)
+        values = z[within & np.isfinite(z)]
+        whole = sum(inner**2 <= i * i + j * j <= outer**2 for i in range(-25, 26) for j in range(-25, 26))
+        if 2 * len(values) > whole:
+            assert found[row, column] == pytest.approx(z[row, column] - values.mean(), abs=1e-9)
+        else:
+            assert np.isnan(found[row, column])
 
 
 def test_tiles_with_a_rim_have_the_bits_of_the_whole():
-    z, rim = _seabed(), derivatives.reach(9)
-    layers = (
-        lambda z: derivatives.slope_deg(z, CELL),
-        lambda z: derivatives.aspect_deg(z, CELL),
-        lambda z: curvatures(z, CELL)[0],
-        lambda z: curvatures(z, CELL)[1],
-        derivatives.ruggedness,
-        derivatives.position,
-        derivatives.roughness,
-        lambda z: derivatives.vector_ruggedness(z, CELL),
-        lambda z: derivatives.surface_rugosity(z, CELL),
-        lambda z: benthic_position(z, 3, 9),
-    )
+    fine, broad = Ring(1, 5), Ring(3, 9)
+    z, rim = _seabed(), derivatives.reach(broad)
+    whole = derivatives.layers(z, CELL, fine, broad)
+    pasted = {name: np.full(z.shape, np.inf, np.float32) for name in whole}
     wide = np.pad(z, rim, constant_values=np.nan)
-    for layer in layers:
-        whole, pasted = layer(z), np.full(z.shape, np.inf)
-        for top in range(0, z.shape[0], 37):
-            for left in range(0, z.shape[1], 41):
-                rows, columns = pasted[top : top + 37, left : left + 41].shape
-                part = layer(wide[top : top + rows + 2 * rim, left : left + columns + 2 * rim])
-                pasted[top : top + rows, left : left + columns] = part[rim:-rim, rim:-rim]
-        assert np.array_equal(whole, pasted, equal_nan=True)
+    for top in range(0, z.shape[0], 37):
+        for left in range(0, z.shape[1], 41):
+            rows, columns = z[top : top + 37, left : left + 41].shape
+            around = wide[top : top + rows + 2 * rim, left : left + columns + 2 * rim]
+            for name, part in derivatives.layers(around, CELL, fine, broad).items():
+                pasted[name][top : top + rows, left : left + columns] = part[rim:-rim, rim:-rim]
+    assert len(whole) == 11
+    for name, values in whole.items():
+        assert np.array_equal(values, pasted[name], equal_nan=True), name
+        assert np.isfinite(values).any(), name

@@ -22,8 +22,8 @@ def _none(image):
 def test_features_follow_a_shift_to_a_fraction_of_a_pixel():
     image = _seabed()
     moved = cv2.warpAffine(image, np.array([[1, 0, 7.4], [0, 1, -3.2]]), image.shape[::-1])
-    a, b = (features.detect(each, _none(each), P) for each in (image, moved))
-    pairs = features.match(a.descriptors, b.descriptors, 0.8)
+    a, b = (features.detect(each, _none(each), P, 0.0) for each in (image, moved))
+    pairs = features.match(a, b, 0.8)
     shift = b.uv[pairs[:, 1]] - a.uv[pairs[:, 0]]
     good = np.linalg.norm(shift - [7.4, -3.2], axis=1) < 1
     assert len(pairs) > 200
@@ -64,12 +64,12 @@ def test_an_image_without_texture_has_no_features():
     grey = np.full((300, 400), 90, np.uint8)
     found = features.detect(grey, _none(grey), P)
     assert found.descriptors.shape == (0, 128)
-    assert features.match(found.descriptors, found.descriptors, 0.8).shape == (0, 2)
+    assert features.match(found, found, 0.8).shape == (0, 2)
 
 
 def test_the_ratio_decides_how_many_matches_there_are():
     a, b = (features.detect(each, _none(each), P) for each in (_seabed(seed=1), _seabed(seed=2)))
-    strict, lax = (len(features.match(a.descriptors, b.descriptors, ratio)) for ratio in (0.7, 0.95))
+    strict, lax = (len(features.match(a, b, ratio)) for ratio in (0.7, 0.95))
     assert 3 * strict < lax
 
 
@@ -86,3 +86,61 @@ def test_features_lie_where_they_are_and_not_a_part_of_a_pixel_beside():
         nearest = np.linalg.norm(off, axis=2).argmin(0)
         middle = np.median(off[nearest, np.arange(len(true))], axis=0)
         assert np.abs(middle).max() < 0.1
+
+
+def _turned(image, degrees):
+    rotation = cv2.getRotationMatrix2D((319.5, 239.5), degrees, 1)
+    return cv2.warpAffine(image, rotation, image.shape[::-1], borderValue=120), rotation
+
+
+def _right(a, b, pairs, rotation):
+    true = a.uv[pairs[:, 0]] @ rotation[:, :2].T + rotation[:, 2]
+    return np.linalg.norm(b.uv[pairs[:, 1]] - true, axis=1) < 1.5
+
+
+def test_features_are_found_again_in_an_image_that_is_turned_if_their_own_gradient_directs_them():
+    image = _seabed()
+    turned, rotation = _turned(image, 40)
+    a, b = (features.detect(each, _none(each), P) for each in (image, turned))
+    pairs = features.match(a, b, 0.8)
+    assert len(pairs) > 150
+    assert _right(a, b, pairs, rotation).mean() > 0.9
+
+
+def test_north_directs_descriptors_and_tells_more_features_apart():
+    image = _seabed()
+    turned, rotation = _turned(image, 40)
+    north = np.radians(-90), np.radians(-130)  # the image turns anticlockwise, so north does, too
+    a, b = (features.detect(e, _none(e), P, n) for e, n in zip((image, turned), north, strict=True))
+    pairs, own = (
+        features.match(a, b, 0.8),
+        features.match(*(features.detect(e, _none(e), P) for e in (image, turned)), 0.8),
+    )
+    assert len(pairs) > 1.1 * len(own)
+    assert _right(a, b, pairs, rotation).mean() > 0.95
+    wrong = features.detect(turned, _none(turned), P, north[0])
+    assert len(features.match(a, wrong, 0.8)) < 0.3 * len(pairs)
+
+
+def test_descriptors_of_a_half_turned_image_are_those_of_the_image_rearranged():
+    image = _seabed()
+    a = features.detect(image, _none(image), P, 0.0)
+    b = features.detect(np.ascontiguousarray(image[::-1, ::-1]), _none(image), P, 0.0)
+    rearranged = b._replace(descriptors=features.half_turned(b.descriptors))
+    pairs = features.match(a, rearranged, 0.8)
+    assert len(pairs) > 0.6 * len(a.uv)
+    assert np.median(np.abs(a.uv[pairs[:, 0]] + b.uv[pairs[:, 1]] - [639, 479])) < 0.3
+    assert len(features.match(a, b, 0.8)) < 0.1 * len(pairs)
+
+
+def test_no_match_is_sought_where_it_is_not_expected():
+    image = _seabed()
+    a = features.detect(image, _none(image), P, 0.0)
+    moved = a._replace(uv=a.uv + np.float32([30, 0]))
+    everywhere = features.match(a, moved, 0.8)
+    assert len(everywhere) > 0.95 * len(a.uv)
+    near = features.match(a, moved, 0.8, features.Expected(a.uv + [25, 0], 40.0))
+    assert len(near) > 0.95 * len(a.uv)
+    assert (near[:, 0] == near[:, 1]).mean() > 0.999
+    far = features.match(a, moved, 0.8, features.Expected(a.uv + [400, 0], 40.0))
+    assert (far[:, 0] == far[:, 1]).sum() == 0

@@ -1,85 +1,111 @@
+"""Triangles of tiles: what they cover, how far they are off, and how tiles fit on each other."""
+
 import numpy as np
 import pytest
 from seamosaic.tasks import grids, mesh
-from seamosaic.tasks.grids import Bounds, Grid
 
-GRID = Grid(0.1, 4_999_900, 46_999_900, 80, 60)
-ORIGIN = np.array([499990.0, 4699990.0, -20.0])
-
-
-def bumpy(grid=GRID):
-    x, y = grids.cell_centres(grid)
-    west, south, *_ = grid.bounds
-    return -22 + 0.4 * np.exp(-((x - west - 5) ** 2 + (y - south - 2) ** 2)) + 0.1 * (x - west)
+CELL, SIDE = 0.02, mesh.SIDE
+HILL = np.array([2.0, -2.5])
 
 
-def area_above(built):
-    a, b, c = (built.vertices[built.triangles[:, k], :2] for k in range(3))
-    return 0.5 * np.cross(np.pad(b - a, ((0, 0), (0, 1))), np.pad(c - a, ((0, 0), (0, 1))))[:, 2]
+def _height(x, y):
+    return -20 + 0.3 * np.exp(-((x - HILL[0]) ** 2 + (y - HILL[1]) ** 2) / 0.2) + 0.1 * x
 
 
-def test_mesh_covers_exactly_the_data_and_faces_up():
-    elevation = bumpy()
-    elevation[20:30, 40:60] = np.nan
-    elevation[5, 5] = np.nan
-    built = mesh.surface_mesh(elevation, GRID, ORIGIN, GRID.bounds, 100_000)
-    areas = area_above(built)
-    assert (areas > 0).all()
-    # around a hole of n x m cells (n + 1)(m + 1) squares go, but the four at its corners leave a triangle
-    squares = 79 * 59 - (11 * 21 - 2) - (2 * 2 - 2)
-    assert areas.sum() == pytest.approx(squares * 0.01, rel=1e-6)
-    assert len(built.vertices) == np.isfinite(elevation).sum()
-    X, Y = grids.cell_centres(GRID)
-    where = np.isfinite(elevation)
-    expected = np.column_stack([X[where], Y[where], elevation[where]]) - ORIGIN
-    np.testing.assert_allclose(built.vertices, expected, atol=1e-8)
+def _tile(column=0, row=0):
+    return _height(*grids.cell_centres(mesh.leaf_grid(column, row, CELL)))
 
 
-def test_texture_coordinates_begin_in_the_south_west():
-    texture = Bounds(GRID.bounds.west - 2, GRID.bounds.south - 1, GRID.bounds.east + 4, GRID.bounds.north + 3)
-    built = mesh.surface_mesh(bumpy(), GRID, ORIGIN, texture, 100_000)
-    place = built.vertices[:, :2] + ORIGIN[:2]
-    expected = (place - [texture.west, texture.south]) / [8 + 6, 6 + 4]
-    np.testing.assert_allclose(built.uv, expected, atol=1e-6)
-    assert built.uv[built.vertices[:, 1].argmax(), 1] > 0.6
+def _vertices(surface):
+    return np.column_stack([surface.nodes * [CELL, -CELL], surface.z])
 
 
-@pytest.mark.parametrize("most", [200, 1500])
-def test_simplification_keeps_the_shape(most):
-    elevation = bumpy()
-    built = mesh.surface_mesh(elevation, GRID, ORIGIN, GRID.bounds, most)
-    assert 0.5 * most < len(built.triangles) <= most
-    assert (area_above(built) > 0).all()
-    assert area_above(built).sum() == pytest.approx(
-        7.9 * 5.9, rel=0.1
-    )  # at most half a cell of the thinned raster is lost at the rim
-    x, y, z = (built.vertices + ORIGIN).T
-    west, south, *_ = GRID.bounds
-    off = z - (-22 + 0.4 * np.exp(-((x - west - 5) ** 2 + (y - south - 2) ** 2)) + 0.1 * (x - west))
-    assert 1e-6 < np.abs(off).max() < 0.06
-    assert built.triangles.max() == len(built.vertices) - 1
+def _area_above(surface):
+    a, b, c = (_vertices(surface)[surface.triangles[:, k], :2] for k in range(3))
+    first, second = b - a, c - a
+    return (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
 
 
-def test_large_rasters_are_thinned_first():
-    grid = Grid(0.02, -513, 401, 700, 600)
-    elevation = bumpy(grid)
-    elevation[:, :200] = np.nan
-    built = mesh.surface_mesh(elevation, grid, np.zeros(3), grid.bounds, 1000)
-    assert 400 < len(built.triangles) <= 1000
-    assert area_above(built).sum() == pytest.approx(500 * 600 * 0.0004, rel=0.08)
-    assert built.vertices[:, 0].min() > grid.bounds.west + 4.0 - 0.02
+def _edges(surface):
+    edges = np.sort(surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+    return np.unique(edges, axis=0, return_counts=True)
 
 
-def test_edges_of_a_box_are_cut_along_the_edge():
-    grid = Grid(0.1, 0, 40, 40, 40)
-    x, y = grids.cell_centres(grid)
-    elevation = np.where(x + y > 4.0, 1.0, 0.0)
-    built = mesh.surface_mesh(elevation, grid, np.zeros(3), grid.bounds, 100_000)
-    steps = np.ptp(built.vertices[built.triangles, 2], axis=1)
-    # every other diagonal would make saw teeth: then each square on the edge has two triangles with a step
-    assert (steps > 0.5).sum() <= 2 * 40
+@pytest.mark.parametrize("tolerance", [0.0, 0.002, 0.05])
+def test_a_mesh_is_cut_where_there_is_no_data_and_whole_elsewhere(tolerance):
+    z = _tile() + np.random.default_rng(0).normal(0, 0.001, (SIDE + 1, SIDE + 1))
+    z[60:91, 100:161] = np.nan
+    surface = mesh.simplified(z, tolerance)
+    areas = _area_above(surface)
+    assert (areas > 0).all()  # seen from above, none folded over
+    # around a hole of n x m nodes (n + 1)(m + 1) squares go, but two of its four corners keep a triangle
+    assert areas.sum() / CELL**2 == pytest.approx(SIDE**2 - (32 * 62) + 1, abs=1.1)
+    edges, faces = _edges(surface)
+    assert faces.max() == 2
+    rim = surface.nodes[edges[faces == 1]]
+    at_rim = ((rim == 0) | (rim == SIDE)).any(-1).all(1)
+    around = (rim[..., 0] >= 99) & (rim[..., 0] <= 161) & (rim[..., 1] >= 59) & (rim[..., 1] <= 91)
+    assert (at_rim | around.all(1)).all()  # no crack anywhere else
+    assert 2 * SIDE < at_rim.sum() <= 4 * SIDE
 
 
-def test_no_surface_is_an_error():
-    with pytest.raises(ValueError, match="no surface to mesh"):
-        mesh.surface_mesh(np.full(GRID.shape, np.nan), GRID, ORIGIN, GRID.bounds, 1000)
+def test_fewer_triangles_where_more_may_be_lost_and_the_loss_is_told():
+    z = _tile() + np.random.default_rng(0).normal(0, 0.001, (SIDE + 1, SIDE + 1))
+    full, some, few = (mesh.simplified(z, tolerance) for tolerance in (0.0, 0.003, 0.02))
+    assert len(full.triangles) == 2 * SIDE**2
+    assert full.error_m == 0
+    assert len(few.triangles) < len(some.triangles) / 3 < len(full.triangles) / 12
+    for surface, tolerance in ((some, 0.003), (few, 0.02)):
+        assert tolerance / 2 < surface.error_m < 2 * tolerance
+        assert surface.error_m == pytest.approx(_largest_departure(surface, z), rel=1e-4)
+
+
+def _largest_departure(surface, z):
+    """Of all nodes from the triangle that each lies in."""
+    found = np.full(z.shape, np.nan)
+    for corners in surface.triangles:
+        (x, y), heights = surface.nodes[corners].T.astype(float), surface.z[corners].astype(float)
+        columns, rows = np.meshgrid(np.arange(x.min(), x.max() + 1), np.arange(y.min(), y.max() + 1))
+        det = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
+        b = ((columns - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (rows - y[0])) / det
+        c = ((x[1] - x[0]) * (rows - y[0]) - (columns - x[0]) * (y[1] - y[0])) / det
+        within = (b >= 0) & (c >= 0) & (b + c <= 1)
+        value = heights[0] * (1 - b - c) + heights[1] * b + heights[2] * c
+        found[rows[within].astype(int), columns[within].astype(int)] = value[within]
+    assert np.isfinite(found).all()
+    return np.abs(found - z).max()
+
+
+@pytest.mark.parametrize(("right", "down"), [(1, 0), (0, 1)])
+def test_neighbours_have_all_nodes_of_their_common_edge(right, down):
+    first, second = (mesh.simplified(_tile(c, r), 0.01) for c, r in ((0, 0), (right, down)))
+    edges = []
+    for surface, at in ((first, SIDE), (second, 0)):
+        axis = 0 if right else 1
+        on_edge = surface.nodes[:, axis] == at
+        edges.append(
+            {(int(n), float(z)) for n, z in zip(surface.nodes[on_edge, 1 - axis], surface.z[on_edge], strict=True)}
+        )
+    assert len(edges[0]) == SIDE + 1
+    assert edges[0] == edges[1]
+
+
+def test_a_coarser_tile_has_every_other_node_of_the_four_below():
+    quarters = {(c, r): _tile(c, r) for c in (0, 1) for r in (0, 1)}
+    z = mesh.halved_resolution(quarters)
+    step = 2 * np.arange(SIDE + 1) + 0.5
+    expected = _height(step * CELL, -step[:, None] * CELL)
+    np.testing.assert_allclose(z, expected, atol=1e-9)
+    lost = mesh.lost_detail(quarters, z)
+    curvature = 0.3 * 2 / 0.2  # of the hill's top, 1/m
+    assert 0.2 * curvature * CELL**2 < lost < 2 * curvature * CELL**2
+    del quarters[1, 0]
+    part = mesh.halved_resolution(quarters)
+    assert np.isnan(part[: SIDE // 2, SIDE // 2 + 1 :]).all()
+    assert np.isfinite(part).sum() == (SIDE + 1) ** 2 - (SIDE // 2) ** 2
+
+
+def test_no_data_no_triangles():
+    surface = mesh.simplified(np.full((SIDE + 1, SIDE + 1), np.nan), 0.01)
+    assert len(surface.triangles) == len(surface.nodes) == 0
+    assert surface.error_m == 0

@@ -119,11 +119,15 @@ def test_the_erased_laser_is_taken_from_the_other_image():
     assert np.quantile(np.abs(result.rgb - truth(TILE))[:, result.mask], 0.999) < 6
     x, _ = grids.cell_centres(TILE)
     assert ((result.source == 4) & (x < -0.1)).sum() > 500
+    assert not result.painted.any()
     # alone, it is painted over: no green, and not far from what is there
     alone = compose(TILE, terrain_of(flat), [left])
     error = np.abs(alone.rgb - truth(TILE))[:, alone.mask]
     assert error.max() < 120
     assert np.quantile(error, 0.99) < 60
+    red, green, blue = compose(TILE, terrain_of(flat), [left._replace(erase=np.zeros_like(left.erase))]).rgb.astype(int)
+    assert alone.painted[green - np.maximum(red, blue) > 200].all()  # and said so
+    assert 0.02 < alone.painted.mean() < 0.15
     assert (alone.mask == compose(TILE, terrain_of(flat), [left._replace(erase=np.zeros_like(left.erase))]).mask).all()
 
 
@@ -144,6 +148,7 @@ def test_what_terrain_hides_is_taken_from_the_image_that_sees_it():
     assert (result.source[(x > 0.42) & (x < 0.47) & (np.abs(y) < 0.2)] == 0).mean() > 0.9
     only = compose(TILE, terrain_of(wall), [near])
     assert only.mask[shadow].all()
+    assert not only.painted.any()  # hidden is not lit
     assert np.median(np.abs(only.rgb - truth(TILE)).max(0)[shadow]) > 12
 
 
@@ -163,6 +168,7 @@ def test_mosaics_of_tiles_are_the_mosaic():
         np.testing.assert_array_equal(result.rgb, whole.rgb[:, at[0], at[1]])
         np.testing.assert_array_equal(result.source, whole.source[at])
         np.testing.assert_array_equal(result.mask, whole.mask[at])
+        np.testing.assert_array_equal(result.painted, whole.painted[at])
 
 
 def test_coarse_cells_average_pixels():

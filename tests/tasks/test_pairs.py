@@ -51,8 +51,10 @@ def test_sequential_pairs():
 def test_seen_by_the_other_image():
     poses = _line(2, 0.9)
     pixels = np.array([[200.0, 20.0], [200.0, 280.0]])  # the northern part is what the next image sees
-    np.testing.assert_array_equal(pairs.seen_by(LENS, pixels, poses, 0, 1, 3.0, 0.0), [True, False])
-    assert pairs.seen_by(LENS, pixels, poses, 0, 1, 3.0, 2.0).all()
+    found = pairs.expected(LENS, pixels, poses, 0, 1, 3.0)
+    np.testing.assert_array_equal(pairs.inside(LENS, found, 0.0), [True, False])
+    np.testing.assert_allclose(found - pixels, [[0, 0.9 / 3 * LENS.fy]] * 2, atol=1)
+    assert pairs.inside(LENS, found, 2.0 / 3 * LENS.fy).all()
 
 
 def test_depth_is_told_by_large_overlaps_on_a_good_base():

@@ -171,3 +171,39 @@ def test_what_is_no_more_than_a_guess_stays_empty():
     assert np.isnan(kept.sigma[gone]).all()
     assert np.nanmax(kept.sigma[kept.source == 3]) <= limit
     assert np.array_equal(kept.elevation[~gone], result.elevation[~gone], equal_nan=True)
+
+
+def test_no_more_guesses_are_shown_than_it_takes():
+    sigma = np.concatenate([np.zeros(500), np.linspace(0.001, 0.04, 450), np.full(50, np.nan)])
+    worst = surface.worst_shown(sigma, 0.8, 0.05)
+    assert np.mean(sigma <= worst) == pytest.approx(0.8, abs=0.002)
+    assert surface.worst_shown(sigma, 0.8, 0.01) == 0.01
+    # where nothing reaches enough ground, all is shown that is certain enough
+    assert surface.worst_shown(sigma, 0.99, 0.05) == 0.05
+    assert surface.worst_shown(np.zeros(0), 0.9, 0.05) == 0.05
+
+
+def test_ground_is_seen_where_an_outline_has_it():
+    b = GRID.bounds
+    square = np.array([[1, 1], [3, 1], [3, 2], [1, 2]], float) + (b.west, b.south)
+    x, y = grids.cell_centres(GRID)
+    within = (x - b.west > 1) & (x - b.west < 3) & (y - b.south > 1) & (y - b.south < 2)
+    found = surface.seen(GRID, square[None])
+    assert (found & within).sum() > 0.99 * within.sum()
+    assert found.sum() < 1.12 * within.sum()
+    assert not surface.seen(GRID, square[None] + 100).any()
+
+
+def test_a_long_tail_widens_the_growth_halfway():
+    rng = np.random.default_rng(7)
+    distance, spread = rng.uniform(0.01, 1, 20_000), np.zeros(20_000)
+    scale = 0.05 * distance**0.6
+    normal, heavy = rng.normal(0, 1, 20_000), rng.standard_t(2, 20_000)
+    heavy /= np.quantile(np.abs(heavy), 0.6827)
+    one, other = (
+        surface.fit_growth(surface.Holdout(np.abs(scale * error), distance, spread)) for error in (normal, heavy)
+    )
+    assert one.scale_m == pytest.approx(0.05, rel=0.06)
+    assert 1.1 < other.scale_m / one.scale_m < 1.6
+    within = np.mean(np.abs(scale * heavy) < 2 * surface.growth_sigma(other, distance, spread))
+    assert 0.92 < within < 0.98

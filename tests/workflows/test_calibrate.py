@@ -147,12 +147,10 @@ def test_board(tmp_path: Path):
 
 def test_lines_that_do_not_cross(tmp_path: Path):
     """Two lines and a new folder: the camera in calibration.yaml, the sheets beside it in planes.yaml."""
-    true, lean = calibration(), np.radians(5)
+    true, lean, turn = calibration(), np.radians(5), np.radians(3)
     assert true.laser is not None
-    planes = tuple(
-        LaserPlane(name=name, normal=(float(np.cos(lean)), 0.0, float(np.sin(lean))), offset=offset)
-        for name, offset in (("a", 0.12), ("b", 0.21))
-    )
+    normal = tuple(float(v) for v in (np.cos(lean) * np.cos(turn), np.sin(turn), np.sin(lean) * np.cos(turn)))
+    planes = tuple(LaserPlane(name=name, normal=normal, offset=offset) for name, offset in (("a", 0.12), ("b", 0.21)))
     light = true.laser.model_copy(update={"planes": planes})
     write_photographs(tmp_path / "photographs", true.model_copy(update={"laser": light}), board_poses(4, 1))
     out = tmp_path / "new" / "out"

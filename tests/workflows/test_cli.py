@@ -1,4 +1,8 @@
 import json
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 from seamosaic.workflows import cli
@@ -55,6 +59,50 @@ def test_run_and_evaluate_print_figures(reef, monkeypatch, capfd):
     assert "nothing changed" in " ".join(capfd.readouterr().out.split())
     assert _main(monkeypatch, "evaluate", reef.out, "--truth", reef.mission) == 0
     assert "trajectory" in json.loads(capfd.readouterr().out)
+
+
+def test_a_json_log_is_one_object_a_line(reef, tiny_mission, monkeypatch, capfd):
+    options = ["--scheduler", "sync", "--log-json"]
+    assert _main(monkeypatch, "run", reef.mission, "-o", reef.out, *options) == 0
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    lines = [json.loads(line) for line in captured.err.splitlines()]
+    assert all({"time", "level", "mission", "step"} <= set(line) for line in lines)
+    assert (lines[-1]["step"], lines[-1]["new"], lines[-1]["path"]) == ("done", False, str(reef.result.path))
+    sorted((tiny_mission / "images").iterdir())[2].write_bytes(b"no image")
+    assert _main(monkeypatch, "run", tiny_mission, "-o", tiny_mission.parent / "out", *options) == 1
+    lines = [json.loads(line) for line in capfd.readouterr().err.splitlines()]
+    assert "nothing to map" in lines[-1]["message"]
+    (extract,) = (line for line in lines if line["step"] == "poses")
+    assert extract["done"] == extract["total"] > 1
+    assert _main(monkeypatch, "run", tiny_mission / "nowhere", "-o", tiny_mission.parent / "out", *options) == 2
+    (line,) = (json.loads(line) for line in capfd.readouterr().err.splitlines())
+    assert (line["level"], line["step"]) == ("error", "invalid")
+
+
+def test_a_cluster_file_and_a_scheduler_are_one_too_many(tiny_mission, monkeypatch, capfd):
+    file = tiny_mission.parent / "cluster.yaml"
+    file.write_text("kind: slurm\n")
+    arguments = ["run", tiny_mission, "-o", tiny_mission.parent / "out", "--cluster", file]
+    assert _main(monkeypatch, *arguments, "--scheduler", "sync") == 2
+    assert "one of them" in " ".join(capfd.readouterr().err.split())
+    assert _main(monkeypatch, *arguments) == 2
+    assert "cluster.yaml:1" in capfd.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("how", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_run_that_is_stopped_says_so(reef, tmp_path, how, code):
+    command = [sys.executable, "-m", "seamosaic.workflows.cli", "run", str(reef.mission), "-o", str(tmp_path)]
+    process = subprocess.Popen([*command, "--workers", "1"], stderr=subprocess.PIPE, text=True)
+    while not list(tmp_path.rglob("*.npz")):
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(how)
+    _, said = process.communicate(timeout=180)
+    assert process.returncode == code
+    assert "run the same command again" in " ".join(said.split())
+    assert not list(tmp_path.rglob(".tmp/*"))
 
 
 def test_simulate_makes_a_mission(tmp_path, monkeypatch):

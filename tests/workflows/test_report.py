@@ -33,6 +33,7 @@ def make_rasters(folder, crs=UTM, covered=True):
         "density.tif": np.where(valid, (cols + rows) % 9, 0),
         "source.tif": np.where(valid, 1 + (cols // 20) % 3, 0),
         "mosaic-source.tif": np.where(valid, cols // 40, -1),
+        **{f"terrain/{name}.tif": np.where(valid, cols % 50 / 50, np.nan) for name in ("slope", "bpi-broad", "vrm")},
     }
     for name, values in layers.items():
         with rasters.product_writer(folder, name, CELL, LEFT, TOP, WIDTH, HEIGHT, crs) as writer:
@@ -115,6 +116,13 @@ def full_quality():
             elevation_max_m=-19.0,
             sigma_median_m=0.01,
         ),
+        terrain=products.TerrainQuality(
+            slope_deg=12.4,
+            rugosity=1.062,
+            bpi_fine=products.RingScale(inner_cells=1, outer_cells=5, inner_m=0.02, outer_m=0.1),
+            bpi_broad=products.RingScale(inner_cells=5, outer_cells=25, inner_m=0.1, outer_m=0.5),
+            contour_interval_m=0.2,
+        ),
         mosaic=products.MosaicQuality(cell_m=0.0021, area_m2=41, coverage_share=0.976),
         mesh=products.MeshQuality(vertices=200_000, triangles=399_000),
         warnings=("2 images are truncated",),
@@ -161,12 +169,13 @@ def full(tmp_path_factory):
 
 
 PICTURES = ("Bathymetry", "Orthomosaic", "Planar mosaic", "Uncertainty", "Source", "Density", "Track")
+TERRAIN = ("Slope", "Position", "Ruggedness")
 FIGURES = ("Precision of soundings", "Navigation minus adjusted")
 
 
 def test_every_picture_is_there_and_not_blank(full):
     page, _ = full
-    assert set(page.images) == {*PICTURES, *FIGURES}
+    assert set(page.images) == {*PICTURES, *TERRAIN, *FIGURES}
     for name, pixels in page.images.items():
         assert pixels.std() > 10, name
         assert min(pixels.shape[:2]) > 250, name
@@ -181,7 +190,17 @@ def test_the_page_needs_nothing_from_elsewhere(full):
 
 def test_the_page_says_the_figures_in_words(full):
     page, text = full
-    for words in ("123,456", "31 of 40", "40% / 35% / 25%", "42.0 m²", "-20.020 to -19.000 m", "± 2.1 mm", "98%"):
+    for words in (
+        "123,456",
+        "31 of 40",
+        "40% / 35% / 25%",
+        "42.0 m²",
+        "-20.020 to -19.000 m",
+        "± 2.1 mm",
+        "98%",
+        "12.4°",
+        "5 to 25 cells",
+    ):
         assert words in text, words
     assert "the sea surface at survey time" in text
     assert "2 images are truncated" in page.texts["Please note"]
@@ -221,7 +240,7 @@ def test_a_local_mission_without_laser_mosaic_or_soundings(tmp_path):
     make_soundings(tmp_path, 0, rasters.local_crs_wkt())
     mission = products.MissionSummary(id="pool", images=products.ImageCounts(total=12))
     page, text = write(tmp_path, products.Quality(mission=mission))
-    assert set(page.images) == {"Bathymetry", "Uncertainty", "Source", "Density", "Track"}
+    assert set(page.images) == {"Bathymetry", "Uncertainty", "Source", "Density", "Track", *TERRAIN}
     for heading in ("Orthomosaic", "Planar mosaic", *FIGURES):
         assert "No data to show" in page.texts[heading]
     assert "no navigation" in page.texts["Navigation minus adjusted"]

@@ -15,19 +15,24 @@ import numpy as np
 import pyogrio
 import pytest
 import rasterio
+import shapely
 import trimesh
 import xarray
 import yaml
 from rio_cogeo import cog_validate
-from seamosaic.catalog import trajectories
+from seamosaic.catalog import memory, trajectories
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.products import PRODUCTS
-from seamosaic.workflows import run as runner
+from seamosaic.tasks import derivatives
+from seamosaic.tasks.grids import Grid
+from seamosaic.workflows import mesh_products, meshing
 from seamosaic.workflows.evaluate import evaluate
+from seamosaic.workflows.job import Done
 from seamosaic.workflows.mapping import NothingToMap
 from seamosaic.workflows.run import run
 
+from tests.products import differing
 from tests.simulated import small_mission
 
 
@@ -35,27 +40,21 @@ def _computed(result):
     return {step.name: step.count_computed for step in result.steps}
 
 
-def _data(folder: Path):
-    """Everything in a version but times and file names."""
-    values = []
-    for name in ("bathymetry.tif", "uncertainty.tif", "source.tif", "mosaic.tif", "mosaic-source.tif"):
-        with rasterio.open(folder / name) as file:
-            values.append(file.read())
-    return [*values, (folder / "trajectory.csv").read_bytes()]
-
-
-def _same(a: Path, b: Path) -> bool:
-    return all(
-        np.array_equal(x, y) if isinstance(x, np.ndarray) else x == y for x, y in zip(_data(a), _data(b), strict=True)
-    )
-
-
 def test_every_product_is_there_and_opens_elsewhere(reef):
     folder = reef.result.path
     assert folder.name == "v1"
     for product in PRODUCTS:
         assert (folder / product.name).stat().st_size > 0, product.name
-    for name in ("bathymetry", "uncertainty", "density", "source", "mosaic", "mosaic-source", "mosaic-planar"):
+    for name in (
+        "bathymetry",
+        "uncertainty",
+        "density",
+        "source",
+        "mosaic",
+        "mosaic-source",
+        "mosaic-painted",
+        "mosaic-planar",
+    ):
         assert cog_validate(folder / f"{name}.tif", quiet=True)[0], name
     with laspy.open(folder / "soundings.laz") as cloud:
         assert cloud.header.point_count == reef.result.quality.soundings.count > 1000
@@ -65,6 +64,116 @@ def test_every_product_is_there_and_opens_elsewhere(reef):
     with xarray.open_dataset(folder / "bathymetry.nc") as layers:
         assert "elevation" in layers
     assert "<html" in (folder / "report.html").read_text()
+
+
+def test_terrain_layers_of_tiles_have_the_bits_of_the_whole_map(reef, small_tiles):
+    """Each run's layers against those of its whole bathymetry.tif at once."""
+    for result in (reef.result, small_tiles):
+        with rasterio.open(result.path / "bathymetry.tif") as file:
+            z, cell = file.read(1, masked=True).filled(np.nan).astype(float), file.res[0]
+        whole = derivatives.layers(z, cell, derivatives.Ring(1, 5), derivatives.Ring(5, 25))
+        for name, values in whole.items():
+            with rasterio.open(result.path / f"terrain/{name}.tif") as file:
+                written = file.read(1, masked=True).filled(np.nan)
+                assert file.tags().get("RING", "").startswith("5 to 25 cells, 0.1") == (name == "bpi-broad")
+            assert np.isfinite(written).sum() > 1000
+            assert np.array_equal(written, values, equal_nan=True), name
+
+
+def test_terrain_layers_follow_their_rings_alone(reef, tmp_path):
+    shutil.copytree(reef.out, tmp_path / "out")
+    parameters = Parameters.model_validate({"terrain": {"broad": {"inner": 0.2, "outer": 0.4, "unit": "metres"}}})
+    result = run(str(reef.mission), tmp_path / "out", parameters, scheduler="sync")
+    assert {step for step, count in _computed(result).items() if count} == {"terrain"}
+    scale = result.quality.terrain.bpi_broad
+    assert scale.outer_cells == round(0.4 / result.quality.bathymetry.cell_m)
+    assert scale.outer_m == pytest.approx(0.4, abs=result.quality.bathymetry.cell_m)
+    too_wide = Parameters.model_validate({"terrain": {"broad": {"inner": 0, "outer": 90, "unit": "metres"}}})
+    with pytest.raises(InvalidInput, match=r"terrain.broad.outer.*smaller ring"):
+        run(str(reef.mission), tmp_path / "out", too_wide, scheduler="sync")
+
+
+def _whole(path):
+    """Vertices (V, 3) x east, y north, z up, each place once, and triangles of all parts of a GLB."""
+    parts = list(trimesh.load(path).geometry.values())
+    vertices = np.concatenate([np.asarray(part.vertices) for part in parts])
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    triangles = np.concatenate([part.faces + k for part, k in zip(parts, first, strict=False)])
+    places, number = np.unique(vertices, axis=0, return_inverse=True)
+    return places[:, [0, 2, 1]] * [1, -1, 1], number.ravel()[triangles]
+
+
+def test_the_mesh_has_no_crack_between_tiles_and_lies_on_the_bathymetry(reef):
+    vertices, triangles = _whole(reef.result.path / "mesh.glb")
+    edges, faces = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0, return_counts=True)
+    assert faces.max() == 2
+    with rasterio.open(reef.result.path / "bathymetry.tif") as file:
+        z, cell = file.read(1, masked=True).filled(np.nan), file.res[0]
+    column, row = np.rint(vertices[:, 0] / cell - 0.5).astype(int), np.rint(-vertices[:, 1] / cell - 0.5).astype(int)
+    np.testing.assert_allclose(vertices[:, 2], z[row, column], atol=1e-5)
+    # rims are where the neighbouring cells have no data, or at the map's edge
+    hollow = np.pad(np.isnan(z), 1, constant_values=True)
+    beside = np.any([hollow[row + i, column + j] for i in range(3) for j in range(3)], axis=0)
+    assert beside[np.unique(edges[faces == 1])].all()
+    quality = reef.result.quality.mesh
+    assert len(triangles) == quality.triangles
+    assert quality.level == 0
+    assert cell / 8 < quality.error_m < cell
+    coloured = trimesh.load(reef.result.path / "mesh.ply", process=False)
+    assert (len(coloured.vertices), len(coloured.faces)) == (quality.vertices, quality.triangles)
+    assert np.ptp(coloured.visual.vertex_colors[:, :3], axis=0).min() > 50
+
+
+def test_tiles_of_the_mesh_are_all_there(reef):
+    folder = reef.result.path / "mesh-3dtiles"
+    tileset = json.loads((folder / "tileset.json").read_text())
+    waiting, names = [tileset["root"]], []
+    while waiting:
+        tile = waiting.pop()
+        waiting += tile.get("children", [])
+        names += [tile["content"]["uri"]] if "content" in tile else []
+    assert sorted(names) == sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.glb"))
+    assert len(names) == reef.result.quality.mesh.tiles
+
+
+def test_textures_of_the_mesh_are_made_as_small_as_asked(reef, tmp_path):
+    shutil.copytree(reef.out, tmp_path / "out")
+    parameters = Parameters.model_validate({"mesh": {"texture_px": 256}})
+    result = run(str(reef.mission), tmp_path / "out", parameters, scheduler="sync")
+    assert not any(_computed(result).values())
+    pixels = [
+        sum(
+            part.visual.material.baseColorTexture.width * part.visual.material.baseColorTexture.height
+            for part in trimesh.load(path / "mesh.glb").geometry.values()
+        )
+        for path in (reef.result.path, result.path)
+    ]
+    assert 256**2 / 4.2 < pixels[1] < 256**2 * 1.02 < pixels[0]
+
+
+def test_a_mission_too_large_for_one_file_is_a_coarser_level_of_its_pyramid():
+    finest = list(meshing.leaves(Grid(0.02, -300, 900, 1500, 1200)))
+    assert len(finest) == 8 * 6
+    levels = meshing.levels(finest)
+    assert [len(level) for level in levels] == [48, 12, 4]
+    pyramid = {
+        place: Done("mesh", str(place), True, 0.0, {"triangles": 9000, "vertices": 5000, "error_m": 0.01})
+        for level in levels
+        for place in level
+    }
+    assert [mesh_products.level_of_file(pyramid, most) for most in (500_000, 108_000, 40_000, 10)] == [0, 1, 2, 2]
+
+
+def test_contours_of_the_survey_lie_on_the_bathymetry(reef):
+    _, _, geometries, (elevations,) = pyogrio.raw.read(reef.result.path / "survey.gpkg", layer="contours")
+    assert len(geometries) > 5
+    with rasterio.open(reef.result.path / "bathymetry.tif") as file:
+        for wkb, elevation in zip(geometries, elevations, strict=True):
+            points = shapely.get_coordinates(shapely.from_wkb(wkb))
+            found = np.array([value[0] for value in file.sample(points[::7])])
+            assert np.median(np.abs(found[found > -9000] - elevation)) < 0.05
+    interval = reef.result.quality.terrain.contour_interval_m
+    assert np.allclose(elevations / interval, np.rint(elevations / interval))
 
 
 def test_products_agree_with_the_truth(reef):
@@ -82,6 +191,18 @@ def test_the_laser_is_gone_from_the_mosaic(reef):
         red, green, blue = file.read().astype(int)
         excess = (green - np.maximum(red, blue))[file.dataset_mask() > 0]
     assert (excess > 60).mean() < 2e-3
+
+
+def test_what_only_the_laser_shows_is_marked(reef):
+    with (
+        rasterio.open(reef.result.path / "mosaic-painted.tif") as marked,
+        rasterio.open(reef.result.path / "mosaic.tif") as mosaic,
+    ):
+        painted, there = marked.read(1) > 0, mosaic.dataset_mask() > 0
+    assert not (painted & ~there).any()
+    share = reef.result.quality.mosaic.painted_share
+    assert painted.sum() / there.sum() == pytest.approx(share, rel=1e-6)
+    assert 1e-4 < share < 0.1  # the cross in images at the edge of a survey of 8
 
 
 def test_mosaic_source_counts_rows_of_the_trajectory(reef):
@@ -166,11 +287,17 @@ def test_dense_matching_can_be_left_out_and_measured_cells_become_interpolated(r
     assert _computed(run(str(reef.mission), tmp_path / "out", fewer, scheduler="sync"))["dense"] == 0
 
 
-def test_small_tiles_many_of_them_empty_give_the_same_maps(reef, tmp_path):
-    """The track runs across the map: no image touches the tiles in its corners."""
-    shutil.copytree(reef.out, tmp_path / "out")
+@pytest.fixture(scope="module")
+def small_tiles(reef, tmp_path_factory):
+    out = tmp_path_factory.mktemp("small-tiles") / "out"
+    shutil.copytree(reef.out, out)
     parameters = Parameters.model_validate({"grid": {"tile_cells": 64}, "mosaic": {"tile_cells": 512}})
-    result = run(str(reef.mission), tmp_path / "out", parameters, scheduler="sync")
+    return run(str(reef.mission), out, parameters, scheduler="sync")
+
+
+def test_small_tiles_many_of_them_empty_give_the_same_maps(reef, small_tiles):
+    """The track runs across the map: no image touches the tiles in its corners."""
+    result = small_tiles
     assert _computed(result)["cells"] > 6
     for name in ("bathymetry.tif", "source.tif", "mosaic-source.tif"):
         with rasterio.open(result.path / name) as small, rasterio.open(reef.result.path / name) as large:
@@ -192,7 +319,7 @@ def test_an_image_without_a_time_is_a_row_of_its_own(spoilt, tmp_path):
 
 def test_processes_give_the_same_data_as_one_thread(reef, tmp_path):
     result = run(str(reef.mission), tmp_path, Parameters(), workers=2)
-    assert _same(result.path, reef.result.path)
+    assert differing(result.path, reef.result.path) == []
 
 
 def _wait_for(folder: Path, count: int, process: subprocess.Popen) -> None:
@@ -215,7 +342,7 @@ def test_a_killed_run_goes_on_where_it_stopped(reef, tmp_path):
     result = run(str(reef.mission), tmp_path, Parameters(), scheduler="sync")
     total = {step.name: step.count_total for step in result.steps}
     assert 3 <= len(kept) == sum(total.values()) - sum(_computed(result).values())
-    assert _same(result.path, reef.result.path)
+    assert differing(result.path, reef.result.path) == []
 
 
 @pytest.fixture
@@ -241,14 +368,14 @@ def test_a_bad_image_is_recorded_and_the_run_goes_on(spoilt, tmp_path):
 
 def test_an_image_changed_during_the_run_is_rejected(spoilt, tmp_path, monkeypatch):
     mission, image = spoilt
-    opened = runner._open
+    opened = memory.open_known
 
     def replaced(*arguments):
         found = opened(*arguments)
         shutil.copy(sorted((mission / "images").iterdir())[4], image)
         return found
 
-    monkeypatch.setattr(runner, "_open", replaced)
+    monkeypatch.setattr(memory, "open_known", replaced)
     result = run(str(mission), tmp_path / "out", Parameters(), scheduler="sync")
     rows = trajectories.read(result.path / "trajectory.csv")
     (status,) = (row.status for row in rows if row.kind == "rejected")

@@ -1,0 +1,95 @@
+"""Frees intermediate results, least recently used first; products are never touched."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime
+from typing import Any, Final, NamedTuple
+
+from fsspec import AbstractFileSystem
+
+from . import json_files, leases
+from .filesystems import asking, connect
+
+STEPS: Final = "steps"
+_SCRATCH: Final = ".tmp"  # of Store
+_MODIFIED: Final = ("mtime", "LastModified", "last_modified", "updated", "created")
+
+
+class Entry(NamedTuple):
+    """A stored result, or what a killed run left of one. used_s : when it was last made or used, POSIX seconds."""
+
+    mission_id: str
+    path: str
+    size: int
+    used_s: float
+
+
+class Pruned(NamedTuple):
+    """What was freed, or would be.
+
+    Attributes
+    ----------
+    before, freed : bytes of all intermediate results, and of those that are gone. entries : how many these were.
+    busy : missions that were left alone because a run is at work on them.
+    """
+
+    before: int
+    freed: int
+    entries: int
+    busy: tuple[str, ...]
+
+
+def prune(out: str, keep_bytes: float, *, dry_run: bool = False, term_s: float = leases.TERM_S) -> Pruned:
+    """Remove intermediate results until what is left of them in OUT is no more than keep_bytes.
+
+    What killed runs left half-written goes first, then what was not used for longest. While a mission's results are
+    removed, its lease is held; one that a run is at work on is left alone.
+    """
+    filesystem, _ = connect(out)
+    entries = [entry for mission_id in json_files.names(out) for entry in _entries(filesystem, out, mission_id)]
+    before = sum(entry.size for entry in entries)
+    missions = {entry.mission_id for entry in entries}
+    busy = {mission_id for mission_id in missions if leases.holder(out, mission_id)}
+    chosen = _choose([entry for entry in entries if entry.mission_id not in busy], before - keep_bytes)
+    freed = [entry for some in chosen.values() for entry in some]
+    if not dry_run:
+        for mission_id, some in chosen.items():
+            try:
+                with leases.take(out, mission_id, "prune", term_s):
+                    _remove(filesystem, [entry.path for entry in some])
+            except leases.Busy:
+                busy.add(mission_id)
+                freed = [entry for entry in freed if entry.mission_id != mission_id]
+    return Pruned(before, sum(entry.size for entry in freed), len(freed), tuple(sorted(busy)))
+
+
+def _entries(filesystem: AbstractFileSystem, out: str, mission_id: str) -> list[Entry]:
+    _, folder = connect(f"{out.rstrip('/')}/{mission_id}/{STEPS}")
+    with asking(filesystem, folder):
+        found: Any = filesystem.find(folder, detail=True)
+    return [Entry(mission_id, path, int(info["size"] or 0), _used_s(info)) for path, info in found.items()]
+
+
+def _used_s(info: Mapping[str, Any]) -> float:
+    when = next((info[name] for name in _MODIFIED if info.get(name) is not None), 0.0)
+    return when.timestamp() if isinstance(when, datetime) else float(when)
+
+
+def _choose(entries: Sequence[Entry], excess: float) -> dict[str, list[Entry]]:
+    """What to remove, by mission."""
+    chosen: dict[str, list[Entry]] = {}
+    for entry in sorted(entries, key=lambda entry: (not _is_half(entry.path), entry.used_s)):
+        if excess > 0 or _is_half(entry.path):
+            chosen.setdefault(entry.mission_id, []).append(entry)
+            excess -= entry.size
+    return chosen
+
+
+def _is_half(path: str) -> bool:
+    return path.split("/")[-2] == _SCRATCH
+
+
+def _remove(filesystem: AbstractFileSystem, paths: Sequence[str]) -> None:
+    for path in paths:
+        with asking(filesystem, path), suppress(FileNotFoundError):
+            filesystem.rm_file(path)

@@ -1,0 +1,143 @@
+"""Cells of image matching, each averaged with as many of its neighbours as lie on one plane with it.
+
+Local planes over growing squares; the largest that says the same as all smaller ones, within what their noise allows,
+counts (intersection of confidence intervals: Katkovnik 1999). On even ground that takes the noise of matching away; on
+rough ground and at edges cells stay as they are.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .gridding import MATCHING, Cells
+from .grids import Grid, cell_centres
+
+Array = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+_RADII = (1, 2, 4)  # cells
+_SPARSE = 2  # beyond this radius every second cell each way says enough
+_NOISE_M = 1e-3  # of weight one, so that single precision does
+_INTERVAL = 2.0  # sigmas
+_LEAST_CELLS = 6
+_SPIKE_CELLS = 5  # neighbours that can tell a cell that it stands out
+_CHANCE = 3.0  # sigmas of chi squared over its freedom: more is no plane
+
+
+class _Moments(NamedTuple):
+    """Weighted sums over a square around each cell: of 1, x, y, xx, xy, yy, z, xz, yz, zz; cells and metres."""
+
+    one: Array
+    x: Array
+    y: Array
+    xx: Array
+    xy: Array
+    yy: Array
+    z: Array
+    xz: Array
+    yz: Array
+    zz: Array
+
+
+def matched(grid: Grid, cells: Cells) -> Cells:
+    """Cells with matched ones smoothed and carried to their centres; those of the laser as they are.
+
+    A cell depends on those within four cells of it and on nothing else.
+    """
+    wanted = cells.source == MATCHING
+    if not wanted.any():
+        return cells
+    X, Y = cell_centres(grid)
+    x, y = (cells.x - X) / grid.cell_m, (cells.y - Y) / grid.cell_m
+    z = np.where(wanted, _without_spikes(cells.elevation), cells.elevation)
+    known = cells.density > 0
+    weight = np.where(known, (_NOISE_M / np.maximum(cells.noise, 1e-5)) ** 2, 0.0)
+    found, noise = z.copy(), cells.noise.copy()
+    low, high = np.full(grid.shape, -np.inf), np.full(grid.shape, np.inf)
+    going, at_centre, last = wanted.copy(), np.zeros(grid.shape, bool), 0
+    uneven = np.ones(grid.shape)
+    sums = _Moments(*(np.zeros(grid.shape, np.float32) for _ in _Moments._fields))
+    count = np.zeros(grid.shape, np.float32)
+    layers = [np.nan_to_num(values).astype(np.float32) for values in (x, y, weight)]
+    for radius in _RADII:
+        _add_ring(sums, count, (last, radius), np.nan_to_num(z), *layers)
+        last = radius
+        height, variance, misfit = _plane(sums, count)
+        if radius == _RADII[0]:
+            torn = wanted & (count >= _LEAST_CELLS) & (misfit > _most(count))
+            uneven = np.sqrt(np.where(torn, misfit, 1))
+        enough = going & (count >= _LEAST_CELLS) & np.isfinite(height) & (variance > 0)
+        height = np.where(enough, height, 0.0)
+        spread = _INTERVAL * np.sqrt(np.where(enough, variance, 0))
+        low, high = (
+            np.where(enough, np.maximum(low, height - spread), low),
+            np.where(enough, np.minimum(high, height + spread), high),
+        )
+        even = (misfit < _most(count)) & (low <= high) & (height >= low) & (height <= high)
+        better = enough & even
+        found[better], noise[better] = (z + height)[better], np.sqrt(variance[better])
+        at_centre |= better
+        going &= better | ~enough
+    # what neighbours differ by, beyond what noise makes them, no plane explains: edges, flanks, wrong matches
+    noise *= uneven
+    sigma = np.sqrt(np.maximum(cells.sigma**2 - cells.noise**2, 0) + noise**2)
+    return cells._replace(
+        elevation=found,
+        sigma=np.where(wanted, sigma, cells.sigma),
+        noise=noise,
+        x=np.where(at_centre, X, cells.x),
+        y=np.where(at_centre, Y, cells.y),
+    )
+
+
+def _most(count: Array) -> Array:
+    """Chi squared over its freedom that so many cells on a plane have by chance at most."""
+    return 1 + _CHANCE * np.sqrt(2 / np.maximum(count - 3, 1))
+
+
+def _without_spikes(z: Array) -> Array:
+    """Elevations held within those of the eight cells around, where most of them are known."""
+    padded = np.pad(z, 1, constant_values=np.nan)
+    low, high, count = np.full(z.shape, np.inf), np.full(z.shape, -np.inf), np.zeros(z.shape, int)
+    for i in (0, 1, 2):
+        for j in (0, 1, 2):
+            if (i, j) != (1, 1):
+                other = padded[i : i + z.shape[0], j : j + z.shape[1]]
+                low, high, count = np.fmin(low, other), np.fmax(high, other), count + np.isfinite(other)
+    return np.where(count >= _SPIKE_CELLS, np.clip(z, low, high), z)
+
+
+def _add_ring(
+    sums: _Moments, count: Array, radii: tuple[int, int], z: Array, x: Array, y: Array, weight: Array
+) -> None:
+    """Adds the cells between two squares to the sums, in place; with the smaller of radius 0 also the cell itself."""
+    inner, outer = radii
+    height, width = z.shape
+    every = _SPARSE if outer > _SPARSE else 1
+    for i in range(-outer, outer + 1, every):
+        for j in range(-outer, outer + 1, every):
+            if inner and max(abs(i), abs(j)) <= inner:
+                continue
+            here = slice(max(0, -i), height - max(0, i)), slice(max(0, -j), width - max(0, j))
+            there = slice(max(0, i), height + min(0, i)), slice(max(0, j), width + min(0, j))
+            # rows go south
+            w, dx, dy = weight[there], x[there] + j, y[there] - i
+            dz = (z[there] - z[here]).astype(np.float32)
+            wx, wy, wz = w * dx, w * dy, w * dz
+            terms = (w, wx, wy, wx * dx, wx * dy, wy * dy, wz, wx * dz, wy * dz, wz * dz)
+            for total, term in zip(sums, terms, strict=True):
+                total[here] += term
+            count[here] += w > 0
+
+
+def _plane(m: _Moments, count: Array) -> tuple[Array, Array, Array]:
+    """Of the planes that fit: height at the cell's centre over its value, its variance, chi squared over freedom."""
+    a, b, c = m.xx * m.yy - m.xy**2, m.xy * m.y - m.x * m.yy, m.x * m.xy - m.xx * m.y
+    with np.errstate(divide="ignore", invalid="ignore"):
+        determinant = m.one * a + m.x * b + m.y * c
+        height = (a * m.z + b * m.xz + c * m.yz) / determinant
+        slope_x = (b * m.z + (m.one * m.yy - m.y**2) * m.xz + (m.x * m.y - m.one * m.xy) * m.yz) / determinant
+        slope_y = (c * m.z + (m.x * m.y - m.one * m.xy) * m.xz + (m.one * m.xx - m.x**2) * m.yz) / determinant
+        left = m.zz - height * m.z - slope_x * m.xz - slope_y * m.yz
+        return height, _NOISE_M**2 * a / determinant, left / _NOISE_M**2 / np.maximum(count - 3, 1)

@@ -1,0 +1,101 @@
+"""What is known of a mission without reading its images, and what makes it unknown."""
+
+import os
+
+import pytest
+from seamosaic.catalog import digests, memory
+from seamosaic.schemas.problems import InvalidInput
+
+
+@pytest.fixture
+def read(monkeypatch):
+    """Images that were read whole."""
+    counted, inspect = [], digests._inspect
+
+    def counting(fs, path):
+        counted.append(path)
+        return inspect(fs, path)
+
+    monkeypatch.setattr(digests, "_inspect", counting)
+    return counted
+
+
+def test_images_are_read_once(tiny_mission, tmp_path, read):
+    url, out = str(tiny_mission), str(tmp_path / "out")
+    first = memory.look(url, out)
+    assert (first.id, first.images, first.unread, first.inputs) == ("tiny", 10, 10, None)
+    assert (first.start, first.end) == ("2026-06-03T02:14:10Z", "2026-06-03T02:14:19Z")
+    assert read == []
+    inputs = memory.inputs_digest(memory.open_known(url, out))
+    assert len(read) == 10
+    assert memory.look(url, out)._replace(inputs=None, unread=10) == first
+    assert memory.look(url, out).inputs == inputs == memory.inputs_digest(memory.open_known(url, out))
+    assert len(read) == 10
+
+
+def test_a_look_at_what_did_not_change_opens_nothing(tiny_mission, tmp_path, monkeypatch):
+    url, out = str(tiny_mission), str(tmp_path / "out")
+    memory.open_known(url, out)
+    before = memory.look(url, out)
+    monkeypatch.setattr(memory, "open_mission", None)
+    assert memory.look(url, out) == before
+
+
+def test_an_image_that_was_changed_is_unread_until_it_is_read(tiny_mission, tmp_path, read):
+    url, out = str(tiny_mission), str(tmp_path / "out")
+    before = memory.inputs_digest(memory.open_known(url, out))
+    image = sorted((tiny_mission / "images").iterdir())[3]
+    image.write_bytes(image.read_bytes() + b"\0")
+    found = memory.look(url, out)
+    assert (found.unread, found.inputs) == (1, None)
+    assert memory.inputs_digest(memory.open_known(url, out)) != before
+    assert len(read) == 11
+    image.write_bytes(image.read_bytes()[:-1])
+    assert memory.inputs_digest(memory.open_known(url, out)) == before
+
+
+def test_a_removed_image_is_known_to_be_gone(tiny_mission, tmp_path, read):
+    url, out = str(tiny_mission), str(tmp_path / "out")
+    before = memory.inputs_digest(memory.open_known(url, out))
+    next((tiny_mission / "images").iterdir()).unlink()
+    found = memory.look(url, out)
+    assert (found.images, found.unread) == (9, 0)
+    assert found.inputs not in (None, before)
+    assert len(read) == 10
+
+
+def test_an_edit_that_keeps_size_and_time_is_seen(tiny_mission, tmp_path):
+    url, out = str(tiny_mission), str(tmp_path / "out")
+    memory.open_known(url, out)
+    before, path = memory.look(url, out), tiny_mission / "calibration.yaml"
+    when = path.stat().st_mtime_ns
+    path.write_text(path.read_text().replace("fx: 80.0", "fx: 81.0"))
+    os.utime(path, ns=(when, when))
+    after = memory.look(url, out)
+    assert after.inputs not in (None, before.inputs)
+    assert [name for name in after.texts if after.texts[name] != before.texts[name]] == ["calibration.yaml"]
+
+
+def test_files_that_do_not_count_do_not(tiny_mission, tmp_path):
+    url, out = str(tiny_mission), str(tmp_path / "out")
+    before = memory.inputs_digest(memory.open_known(url, out))
+    (tiny_mission / "notes.txt").write_text("windy")
+    assert memory.look(url, out).inputs == before
+
+
+def test_what_is_wrong_is_said_each_time(tiny_mission, tmp_path):
+    out = str(tmp_path / "out")
+    memory.open_known(str(tiny_mission), out)
+    (tiny_mission / "calibration.yaml").unlink()
+    for _ in range(2):
+        with pytest.raises(InvalidInput, match=r"no file calibration\.yaml"):
+            memory.look(str(tiny_mission), out)
+
+
+def test_a_damaged_memory_is_none(tiny_mission, tmp_path, read):
+    url, out = str(tiny_mission), tmp_path / "out"
+    memory.open_known(url, str(out))
+    (file,) = (out / memory.FOLDER).iterdir()
+    file.write_text('{"images": 3}')
+    memory.open_known(url, str(out))
+    assert len(read) == 20

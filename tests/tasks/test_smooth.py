@@ -1,0 +1,76 @@
+"""Matched cells averaged over planes: noise goes, edges stay."""
+
+import numpy as np
+from seamosaic.tasks import gridding, grids, smooth
+from seamosaic.tasks.grids import Grid
+
+GRID = Grid(0.02, 25_000_000, 235_000_000, 70, 60)
+X, Y = grids.cell_centres(GRID)
+
+
+def _cells(z, noise, source=gridding.MATCHING, seed=0):
+    rng = np.random.default_rng(seed)
+    shape = GRID.shape
+    return gridding.Cells(
+        elevation=z + rng.normal(0, noise, shape),
+        sigma=np.full(shape, np.hypot(noise, 0.001)),
+        noise=np.full(shape, noise),
+        density=np.ones(shape, np.int32),
+        source=np.broadcast_to(np.asarray(source, np.uint8), shape).copy(),
+        x=X + rng.uniform(-0.004, 0.004, shape),
+        y=Y + rng.uniform(-0.004, 0.004, shape),
+    )
+
+
+def test_even_ground_loses_its_noise_and_says_so():
+    slope = -10 + 0.3 * (X - X.min()) + 0.2 * (Y - Y.min())
+    before = _cells(slope, 0.002)
+    after = smooth.matched(GRID, before)
+    error = (after.elevation - slope)[5:-5, 5:-5]
+    assert 0.0002 < np.std(error) < 0.0008
+    stated = after.noise[5:-5, 5:-5]
+    assert 0.6 < np.mean(np.abs(error) < stated) < 0.8
+    assert np.median(after.sigma) < np.median(before.sigma)
+    # what neighbours share does not average down
+    assert np.median(after.sigma) > 0.001
+    assert 0.97 < np.mean(np.abs(after.x - X)[5:-5, 5:-5] < 1e-9) <= 1
+
+
+def test_an_edge_stays_where_it_is():
+    step = -10 + 0.2 * (GRID.left * 0.02 + 0.7 > X)
+    after = smooth.matched(GRID, _cells(step, 0.002))
+    assert np.quantile(np.abs(after.elevation - step), 0.999) < 0.007
+    assert np.std((after.elevation - step)[:, 5:25]) < 0.0009
+
+
+def test_rough_ground_is_left_as_it_is():
+    rough = -10 + np.random.default_rng(1).normal(0, 0.03, GRID.shape)
+    cells = _cells(rough, 0.002)._replace(x=X, y=Y)
+    after = smooth.matched(GRID, cells)
+    kept = np.abs(after.elevation - cells.elevation) < 1e-9
+    # but for cells that all of their neighbours contradict: of nine, the highest and the lowest
+    assert 0.6 < kept.mean() < 0.9
+    assert np.median(after.noise) > 3 * 0.002
+
+
+def test_spikes_go_and_the_laser_stays():
+    flat = np.full(GRID.shape, -10.0)
+    cells = _cells(flat, 0.001)
+    spiky = np.random.default_rng(2).random(GRID.shape) < 0.02
+    cells.elevation[spiky] += 0.3
+    assert np.quantile(np.abs(smooth.matched(GRID, cells).elevation + 10), 0.99) < 0.004
+    laser = _cells(flat, 0.001, gridding.LASER)
+    laser.source[:, ::2] = gridding.MATCHING
+    after = smooth.matched(GRID, laser)
+    for before, now in zip(laser, after, strict=True):
+        np.testing.assert_array_equal(before[:, 1::2], now[:, 1::2])
+
+
+def test_a_cell_is_the_same_in_every_tile():
+    cells = _cells(-10 + 0.05 * np.sin(9 * X) * np.cos(7 * Y), 0.002)
+    whole = smooth.matched(GRID, cells)
+    part = grids.pad(GRID, -13)
+    cut = grids.window(GRID, part)
+    made = smooth.matched(part, gridding.Cells(*(values[cut] for values in cells)))
+    for a, b in zip(made, whole, strict=True):
+        np.testing.assert_array_equal(a[6:-6, 6:-6], b[cut][6:-6, 6:-6])
