@@ -20,7 +20,7 @@ Indices = NDArray[np.intp]
 
 _REACH = 0.06  # slope, from a tie point to the nearest sounding: 18 cm at 3 m
 _NEIGHBOURS = 12
-_WIDEST = 2.5  # reaches within which a tie point has its neighbours, for the seabed's slope to be known there
+_WIDEST = 1.5  # reaches within which a tie point has its neighbours, for the seabed's slope to be known there
 _STEEPEST = 3.0
 _SOUNDING_SIGMA_M = 0.001
 FIRST_ROUGHNESS = 0.12
@@ -79,20 +79,20 @@ def measure(poses: Poses, X: Array, soundings: Mapping[int, Array], most: int) -
         tree, slope, width = KDTree(X[:, :2]), slopes(X), _neighbours(X)[0]
         for k, own in soundings.items():
             if len(own) and np.isfinite(poses.C_local[k]).all():
-                track, range_m, away_m = _of_image(poses, k, own, X, slope, tree, most)
-                known = width[track] < _WIDEST * _REACH * float(np.median(own[:, 2]))
-                track, range_m, away_m = track[known], range_m[known], away_m[known]
+                known = width < _WIDEST * _REACH * float(np.median(own[:, 2]))
+                track, range_m, away_m = _of_image(poses, k, own, X, slope, tree, most, known)
                 found.append((np.full(len(track), k, np.intp), track, range_m, away_m, slope[track]))
     return Ranges(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
-def _of_image(poses: Poses, k: int, own: Array, X: Array, slope: Array, tree: KDTree, most: int):
-    """Tie points (K,) near the laser of image k, their ranges and how far each is from a sounding."""
+def _of_image(poses: Poses, k: int, own: Array, X: Array, slope: Array, tree: KDTree, most: int, known: Array):
+    """Tie points (K,), of those with a known slope, near the laser of image k; ranges; how far each is from a sounding."""
     R, C = poses.R_local_camera[k], poses.C_local[k]
     ground = own @ R.T + C
     centre = ground[:, :2].mean(0)
     radius = np.linalg.norm(ground[:, :2] - centre, axis=1).max() + _REACH * float(np.median(own[:, 2]))
     near = np.array(sorted(tree.query_ball_point(centre, radius)), np.intp)
+    near = near[known[near]]
     seen = (X[near] - C) @ R
     near, seen = near[seen[:, 2] > 0], seen[seen[:, 2] > 0]
     lit, count = KDTree(own[:, :2] / own[:, 2:]), min(_NEAREST, len(own))

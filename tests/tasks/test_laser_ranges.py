@@ -4,10 +4,10 @@ from seamosaic.tasks import laser_ranges
 from tests.tasks import scenes
 
 
-def _scene(relief_m, seed=0):
+def _scene(relief_m, seed=0, count=12_000):
     rng = np.random.default_rng(seed)
     points, poses = scenes.seabed(relief_m), scenes.cameras([[0, 0, 0], [0, 0.8, 0]])
-    X = points[rng.permutation(len(points))[:6000]]
+    X = points[rng.permutation(len(points))[:count]]
     return poses, X, {k: scenes.cross(relief_m, poses, k, rng) for k in (0, 1)}
 
 
@@ -19,6 +19,11 @@ def test_ranges_near_the_laser_are_true_on_slopes_too():
     assert (np.bincount(found.image) > 80).all()
     assert 2e-4 < 1.48 * np.median(np.abs(error)) < 0.01
     assert abs(error.mean()) < 0.002
+
+
+def test_few_tie_points_do_not_tell_how_the_seabed_runs():
+    poses, X, soundings = _scene(0.3, count=1500)
+    assert len(laser_ranges.measure(poses, X, soundings, 200).track) < 10
 
 
 def test_the_roughness_is_measured():
