@@ -86,7 +86,7 @@ def measure(poses: Poses, X: Array, soundings: Mapping[int, Array], most: int) -
 
 
 def _of_image(poses: Poses, k: int, own: Array, X: Array, slope: Array, tree: KDTree, most: int, known: Array):
-    """Tie points (K,), of those with a known slope, near the laser of image k; ranges; how far each is from a sounding."""
+    """Tie points (K,) of known slope near the laser of image k, their ranges and how far each is from a sounding."""
     R, C = poses.R_local_camera[k], poses.C_local[k]
     ground = own @ R.T + C
     centre = ground[:, :2].mean(0)
