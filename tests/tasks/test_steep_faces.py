@@ -47,7 +47,7 @@ def _charts(views, z=None):
     z = _step() if z is None else z
     X, triangles = _mesh(z)
     times = {shot.number: 1 for shot, _ in views}
-    return X, triangles, steep_faces.charts(X, triangles, _terrain(z), views, times, PIXEL)
+    return X, triangles, steep_faces.charts(X, triangles, _terrain(z), GRID, views, times, PIXEL)
 
 
 def test_the_image_that_faces_a_side_shows_it():
