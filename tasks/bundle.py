@@ -35,9 +35,10 @@ _TOLERANCES = 1e-2, 1e-2, 1e-3, 3e-4  # of each round: what the next one changes
 _LEAST_SIGHTS = 4  # of an image that tie points hold: three leave several poses
 _COVARIANCE_SIGMA_PX = 1.0  # of sights, for the covariances: what calibration leaves is shared by many
 _RANGE_GATE = 6.0  # sigmas
-# Ranges beside each other are carried along one slope and err alike. Sights hold an image against that; where it has
-# none, as laser images have, so many ranges count as one.
-_ALIKE = 12
+# Ranges beside each other are carried along one slope and err alike, all of them where the image is in a wrong place.
+# Sights hold an image against that; the ranges of one that has none, as laser images have, together count as what they
+# tell: height, roll and pitch. So many of them hold it.
+_TOLD, _HOLDING = 3, 36
 _SLOPE_SIGMA = 0.03
 _MAD_TO_SIGMA = 1.4826
 
@@ -121,7 +122,7 @@ def _by_laser(found: Bundle, lines: Lines, count: int) -> NDArray[np.bool_]:
     block = found.block
     if np.isin(lines.image, block.sights.image).any():
         return np.zeros(count, bool)
-    ranged = np.bincount(block.ranges.image, minlength=count) >= crossovers.LEAST_OF_IMAGE * _ALIKE
+    ranged = np.bincount(block.ranges.image, minlength=count) >= _HOLDING
     every = crossovers.find(found.poses, lines)
     kept = crossovers.believable(every, crossovers.LEAST_OF_IMAGE * len(np.unique(lines.image)))
     return ranged | crossovers.holds(every, kept, count)
@@ -194,7 +195,8 @@ def _observations(block: Block, poses: Poses, sigma_px: float, p: AdjustParamete
     """Cauchy's kernel at twice the threshold of pair motions: a wrong match must not pull, however many it has."""
     sigma_m = laser_ranges.sigma(block.ranges.away_m, block.roughness)
     blind = ~np.isin(block.ranges.image, block.sights.image)
-    sigma_m = np.where(blind, np.sqrt(_ALIKE) * sigma_m, sigma_m)
+    alike = np.bincount(block.ranges.image)[block.ranges.image] / _TOLD
+    sigma_m = np.where(blind, np.sqrt(np.maximum(alike, 1)) * sigma_m, sigma_m)
     ranges, normal = _along_normals(poses, block.X, block.ranges, blind)
     sigma = sigma_px / block.focal_px
     return observations(block.sights, block.x, sigma, ranges, sigma_m, normal, 2 * p.robust_threshold)

@@ -23,6 +23,7 @@ Indices = NDArray[np.intp]
 
 _ROUNDS: Final = 4
 _ROUNDS_BENT: Final = 7
+_RELEASES: Final = 2
 _BEND: Final = 0.01  # how far a board may bend, as a share of its size
 _PRINTED: Final = 0.01  # how far a corner may be from its place, as a share of the distance to the next
 _NUDGE_M: Final = 1e-6
@@ -97,6 +98,7 @@ class BoardResult(NamedTuple):
 
 class _Problem(NamedTuple):
     data: BoardData
+    printed: Array
     camera: Camera
     names: tuple[str, ...]
     free: tuple[str, ...]
@@ -129,7 +131,8 @@ def calibrate_board(data: BoardData, camera: Camera, free: Sequence[str], bent: 
     """
     names = (*_PINHOLE, *DISTORTION[camera.model])
     poses = first_poses(camera, _by_image(data))
-    problem = _Problem(data, camera, names, tuple(free), (), np.zeros(0), _CORNER_SIGMA_PX, 1.0, FLAT)
+    printed, unknown = data.corner_board, np.zeros(0)
+    problem = _Problem(data, printed, camera, names, tuple(free), (), unknown, _CORNER_SIGMA_PX, 1.0, FLAT)
     light = _on_board(_State(camera, np.zeros((0, 4)), FLAT, poses), data)
     count = int(data.laser_sheet.max(initial=-1)) + 1
     starts = tuple(first_sheet(str(s), light[data.laser_sheet == s]) for s in range(count))
@@ -140,8 +143,8 @@ def calibrate_board(data: BoardData, camera: Camera, free: Sequence[str], bent: 
     chosen, solved = problem, None
     for _ in range(_ROUNDS_BENT if bent else _ROUNDS):
         problem = problem._replace(per_px=_per_px(x, problem))
-        chosen = _chosen(problem, corner_used, laser_used)
-        solved = solve(lambda x, p=chosen: _residuals(x, p), x, _layout(chosen), _rows(chosen))
+        chosen, adjusted = _chosen(problem, corner_used, laser_used), corner_used
+        solved = _adjusted(x, chosen)
         x = solved.x
         corner, laser = _groups(chosen)
         sigma = np.clip(problem.corner_sigma * unit_sigma(solved, corner), _BEST_CORNER_PX, 5)
@@ -153,32 +156,38 @@ def calibrate_board(data: BoardData, camera: Camera, free: Sequence[str], bent: 
         corner_off, laser_off = _misfits(x, problem)
         corner_used, laser_used = _within(np.hypot(*corner_off.T)), _within(np.abs(laser_off))
         if bent:
-            problem = problem._replace(data=_released(problem, x, corner_off, corner_used, data.corner_board))
+            problem = problem._replace(data=_released(problem, chosen, solved, adjusted))
     assert solved is not None
     return _result(x, solved, problem, corner_used, laser_used)
 
 
-def _released(p: _Problem, x: Array, off: Array, used: NDArray[np.bool_], printed: Array) -> BoardData:
-    """The data with every corner of the board moved to where all images together have it.
+def _released(p: _Problem, chosen: _Problem, solved: Solved, used: NDArray[np.bool_]) -> BoardData:
+    """The data of p with every corner of the board moved to where all images together have it.
 
     As Strobl and Hirzinger 2011 (and cv2.calibrateCameraRO) release the target, but with the printed places as a
-    prior, so that scale and pose of the board stay. The light has no say in it.
+    prior, so that scale and pose of the board stay. Poses, lens and shape follow the places, and are eliminated from
+    the normal equations: a step that held them would be a small part of the way, for their errors look alike.
 
     Parameters
     ----------
-    off : (P, 2) pixels, projected minus seen. used : (P,). printed : (P, 3) metres, before any release.
+    chosen, solved : the part of p that was adjusted, and its solution. used : (P,) which corners of p that part has.
     """
-    state, d = _unpacked(x, p), p.data
+    state, d = _unpacked(solved.x, chosen), chosen.data
     J = np.stack([_corners(state, d, step) - _corners(state, d, -step) for step in _NUDGE_M * np.eye(3)], axis=2)
-    J = np.nan_to_num(J / (2 * _NUDGE_M)) * used[:, None, None]
-    places, number = np.unique(printed, axis=0, return_inverse=True)
+    J = np.nan_to_num(J) / (2 * _NUDGE_M * chosen.corner_sigma)
+    places, number = np.unique(p.printed, axis=0, return_inverse=True)
+    by_place = np.zeros((*J.shape[:2], len(places), 3))
+    by_place[np.arange(len(J)), :, number[used]] = J
+    by_place = by_place.reshape(2 * len(J), -1)
+    corner, _ = _groups(chosen)
     now = np.zeros_like(places)
-    now[number] = d.corner_board - printed
-    normal, right = np.zeros((len(places), 3, 3)), np.zeros((len(places), 3))
-    np.add.at(normal, number, np.einsum("pki,pkj->pij", J, J))
-    np.add.at(right, number, np.einsum("pki,pkj,pj->pi", J, J, now[number]) - np.einsum("pki,pk->pi", J, off))
-    prior = (p.corner_sigma / (_PRINTED * float(np.min(pdist(places))))) ** 2 * np.eye(3)
-    return d._replace(corner_board=printed + np.linalg.solve(normal + prior, right[..., None])[number, :, 0])
+    now[number] = p.data.corner_board - p.printed
+    prior = (_PRINTED * float(np.min(pdist(places)))) ** -2
+    joint = by_place.T @ solved.jacobian[corner] @ solved.covariance
+    normal = by_place.T @ (by_place - solved.jacobian[corner] @ joint.T) + prior * np.eye(3 * len(places))
+    slope = by_place.T @ solved.residual[corner] - joint @ (solved.jacobian.T @ solved.residual)
+    now = now - np.linalg.solve(normal, slope + prior * now.ravel()).reshape(now.shape)
+    return p.data._replace(corner_board=p.printed + now[number])
 
 
 def _alike(residual: Array, data: BoardData) -> float:
@@ -244,7 +253,7 @@ def _chosen(p: _Problem, corner: NDArray[np.bool_], laser: NDArray[np.bool_]) ->
         d.laser_sigma_px[laser],
         d.images,
     )
-    return p._replace(data=kept, per_px=p.per_px[laser])
+    return p._replace(data=kept, printed=p.printed[corner], per_px=p.per_px[laser])
 
 
 def _unpacked(x: Array, p: _Problem) -> _State:
@@ -349,10 +358,19 @@ def _result(x: Array, solved: Solved, p: _Problem, corner_used: NDArray, laser_u
     )
 
 
+def _adjusted(x: Array, p: _Problem) -> Solved:
+    return solve(lambda y: _residuals(y, p), x, _layout(p), _rows(p))
+
+
 def _without(x: Array, p: _Problem, corner: NDArray, laser: NDArray, image: int) -> tuple[_State, Array]:
     """What an adjustment finds, and its shared unknowns, that knows nothing of the light in one image."""
     chosen = _chosen(p, corner, laser & (p.data.laser_image != image))
-    solved = solve(lambda y: _residuals(y, chosen), x, _layout(chosen), _rows(chosen))
+    solved = _adjusted(x, chosen)
+    for _ in range(_RELEASES if len(p.shape.terms) else 0):
+        # that image's light has had a say in where the corners are, too
+        every = np.ones(len(chosen.data.corner_uv), bool)
+        chosen = chosen._replace(data=_released(chosen, chosen, solved, every))
+        solved = _adjusted(solved.x, chosen)
     return _unpacked(solved.x, chosen), _layout(chosen).split(solved.x)[0]
 
 

@@ -18,6 +18,8 @@ _NEAR_PX = 4.0
 _APART_WIDTHS = 8.0
 _MIN_POINTS = 30
 _POINTS_A_LINE = 60
+_CLIPPED = 250
+_PLATEAU_PX = 4
 
 
 class Lines(NamedTuple):
@@ -61,6 +63,36 @@ def averaged(uv: Array, sheet: Indices, sigma_px: Array) -> tuple[Array, Indices
         parts.append((mean, np.full(len(first), number, np.intp), sigma))
     uv_, sheet_, sigma_ = (np.concatenate(column) for column in zip(*parts, strict=True))
     return uv_, sheet_, sigma_
+
+
+def between_edges(image: NDArray[np.uint8], uv: Array) -> Array:
+    """Points (N, 2), each that is on a broad clipped crest moved to the middle between the crest's edges.
+
+    A line that outshines the sensor keeps its two steep edges, and nothing between them. The glare beside them is
+    uneven, a third as bright as what can be shown and much wider, so that it draws any centroid to one side by a third
+    of a pixel; the edges it moves by a tenth of that.
+
+    Parameters
+    ----------
+    image : (H, W, 3) or (H, W) uint8. uv : (N, 2) pixels, on lines that cross the rows.
+    """
+    green = image if image.ndim == 2 else image[..., 1]
+    height, width = green.shape
+    row = np.clip(np.round(uv[:, 1]).astype(int), 1, height - 2)
+    column, number = np.clip(np.round(uv[:, 0]).astype(int), 0, width - 1), np.arange(len(uv))
+    level = green[row[:, None] + np.arange(-1, 2)].mean(axis=1)
+    below = level < _CLIPPED
+    left = np.maximum.accumulate(np.where(below, np.arange(width), -1), axis=1)[number, column]
+    right = np.minimum.accumulate(np.where(below, np.arange(width), width)[:, ::-1], axis=1)[number, width - 1 - column]
+    broad = np.flatnonzero((left >= 0) & (right < width) & (right - left > _PLATEAU_PX))
+    number, left, right = number[broad], left[broad], right[broad]
+    inward = [
+        (_CLIPPED - level[number, at]) / (level[number, at + side] - level[number, at])
+        for at, side in ((left, 1), (right, -1))
+    ]
+    moved = uv.copy()
+    moved[broad] = np.column_stack([0.5 * (left + inward[0] + right - inward[1]), row[broad]])
+    return moved
 
 
 def rising(sheet: LaserPlane) -> bool:

@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 
 from ..schemas.parameters import LaserParameters
 from . import corner_fit, laser
+from .calibration_lines import between_edges
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -176,7 +177,7 @@ def parallel_lines(image_bgr: NDArray[np.uint8], allowed: Array | None, count: i
     for number, own in enumerate(order):
         sheet[own] = number
     told = sheet >= 0
-    return Light(uv[told], sheet[told], sigma[told])
+    return Light(between_edges(image_bgr, uv[told]), sheet[told], sigma[told])
 
 
 def straight_lines(uv: Array, count: int) -> list[NDArray[np.intp]]:

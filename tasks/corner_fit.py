@@ -10,11 +10,13 @@ from scipy.special import erf
 Array = NDArray[np.float64]
 
 _REACH: Final = 0.35  # of the side of a square
-_REACH_PX: Final = (3, 15)
+_REACH_PX: Final = (3, 40)
 _FARTHEST_PX: Final = 3.0
 _SATURATED: Final = 254
 _BLUR_PX: Final = 1.5
 _LEAST_PIXELS: Final = 30
+_OFF_EDGE: Final = 0.9  # of the model's edges, -1 to 1: a pixel beyond is on one square only
+_LEAST_NOISE: Final = 0.1  # of the one kind of square, as a share of the other's
 
 
 def refined(grey: NDArray[np.uint8], uv: Array, size: tuple[int, int]) -> Array:
@@ -23,6 +25,9 @@ def refined(grey: NDArray[np.uint8], uv: Array, size: tuple[int, int]) -> Array:
     Two blurred edges cross in each corner, under a light that may change linearly across it on bright and on dark
     squares by themselves. A gradient of light, as beside a laser's glare, moves the corners that look for orthogonal
     gradients (cv2.cornerSubPix) by half a pixel; this model has it. Saturated pixels are left out.
+
+    Texture and speckle of a surface grow with the light that it throws back, so bright squares are much less even than
+    dark ones. The scatter on both is measured, and pixels are weighed by it: that is the likelihood's maximum.
 
     Parameters
     ----------
@@ -50,17 +55,34 @@ def _fitted(grey: NDArray[np.uint8], uv: Array, along: Array, down: Array, reach
     x, y, seen = x[use], y[use], (seen - seen.mean()) / seen.std()
     light = np.stack([np.ones_like(x), x / reach, y / reach], axis=1)
 
-    def misfit(p: Array) -> Array:
-        edges = _edge(x - p[0], y - p[1], p[2], p[4]) * _edge(x - p[0], y - p[1], p[3], p[4])
-        model = np.concatenate([light, light * edges[:, None]], axis=1)
+    def edges(p: Array) -> Array:
+        return _edge(x - p[0], y - p[1], p[2], p[4]) * _edge(x - p[0], y - p[1], p[3], p[4])
+
+    def misfit(p: Array, weight: Array) -> Array:
+        model = np.concatenate([light, light * edges(p)[:, None]], axis=1) * weight[:, None]
         # brightness and contrast are linear: eliminated, so that five unknowns remain
-        return model @ np.linalg.lstsq(model, seen, rcond=None)[0] - seen
+        level = np.linalg.lstsq(model.T @ model, model.T @ (seen * weight), rcond=None)[0]
+        return model @ level - seen * weight
 
     start = np.array([*(uv - [u, v]), np.arctan2(*along[::-1]), np.arctan2(*down[::-1]), _BLUR_PX])
     bounds = start - [4, 4, 0.5, 0.5, _BLUR_PX - 0.3], start + [4, 4, 0.5, 0.5, 6.0]
-    found = least_squares(misfit, start, bounds=bounds, x_scale=[0.5, 0.5, 0.05, 0.05, 0.5], max_nfev=30).x
+    scale = [0.5, 0.5, 0.05, 0.05, 0.5]
+    weight, found = np.ones_like(x), start
+    for _ in range(2):
+        found = least_squares(misfit, found, bounds=bounds, x_scale=scale, max_nfev=30, args=(weight,)).x
+        weight = _weight(misfit(found, np.ones_like(x)), edges(found))
     moved = found[:2] + [u, v]
     return moved if np.hypot(*(moved - uv)) < _FARTHEST_PX else uv
+
+
+def _weight(residual: Array, edges: Array) -> Array:
+    """Weights (N,) of pixels by the scatter on either kind of square, in between where an edge is blurred."""
+    sides = [residual[side * edges > _OFF_EDGE] for side in (1, -1)]
+    if min(len(side) for side in sides) < _LEAST_PIXELS:
+        return np.ones_like(residual)
+    variance = np.array([float(np.mean(side**2)) for side in sides])
+    variance = np.maximum(variance / max(float(variance.max()), 1e-12), _LEAST_NOISE**2)
+    return 1 / np.sqrt(variance[1] + (variance[0] - variance[1]) * 0.5 * (1 + edges))
 
 
 def _edge(x: Array, y: Array, angle: float, blur: float) -> Array:

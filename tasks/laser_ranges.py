@@ -20,6 +20,7 @@ Indices = NDArray[np.intp]
 
 _REACH = 0.06  # slope, from a tie point to the nearest sounding: 18 cm at 3 m
 _NEIGHBOURS = 12
+_WIDEST = 2.5  # reaches within which a tie point has its neighbours, for the seabed's slope to be known there
 _STEEPEST = 3.0
 _SOUNDING_SIGMA_M = 0.001
 FIRST_ROUGHNESS = 0.12
@@ -51,7 +52,7 @@ def slopes(X: Array) -> Array:
     """Rise of the seabed to the east and north (N, 2) at points X (N, 3), by the plane of their neighbours."""
     if len(X) <= _NEIGHBOURS:
         return np.zeros((len(X), 2))
-    nearest = np.asarray(KDTree(X[:, :2]).query(X[:, :2], k=_NEIGHBOURS)[1])
+    nearest = _neighbours(X)[1]
     around = X[nearest] - X[nearest].mean(1, keepdims=True)
     xy, z = around[:, :, :2], around[:, :, 2]
     normal = np.einsum("nki,nkj->nij", xy, xy)
@@ -61,17 +62,26 @@ def slopes(X: Array) -> Array:
     return np.clip(found, -_STEEPEST, _STEEPEST)
 
 
+def _neighbours(X: Array) -> tuple[Array, Indices]:
+    """Distance to the farthest of the nearest points (N,), and which these are (N, 12)."""
+    distance, nearest = KDTree(X[:, :2]).query(X[:, :2], k=_NEIGHBOURS)
+    return np.asarray(distance)[:, -1], np.asarray(nearest)
+
+
 def measure(poses: Poses, X: Array, soundings: Mapping[int, Array], most: int) -> Ranges:
     """Ranges to tie points X (N, 3), local, from the soundings (L, 3) of images in their camera frames.
 
-    most : ranges of an image; those to the tie points nearest to its soundings are taken.
+    most : ranges of an image; those to the tie points nearest to its soundings are taken. Where tie points are few and
+        far between, nothing tells how the seabed runs from them to the laser, and there are no ranges.
     """
     found = [(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0), np.zeros(0), np.zeros((0, 2)))]
-    if len(X):
-        tree, slope = KDTree(X[:, :2]), slopes(X)
+    if len(X) > _NEIGHBOURS:
+        tree, slope, width = KDTree(X[:, :2]), slopes(X), _neighbours(X)[0]
         for k, own in soundings.items():
             if len(own) and np.isfinite(poses.C_local[k]).all():
                 track, range_m, away_m = _of_image(poses, k, own, X, slope, tree, most)
+                known = width[track] < _WIDEST * _REACH * float(np.median(own[:, 2]))
+                track, range_m, away_m = track[known], range_m[known], away_m[known]
                 found.append((np.full(len(track), k, np.intp), track, range_m, away_m, slope[track]))
     return Ranges(*(np.concatenate(column) for column in zip(*found, strict=True)))
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from seamosaic.tasks.calibration_lines import averaged
+from seamosaic.tasks.calibration_lines import averaged, between_edges
 
 
 def test_neighbouring_rows_are_averaged_and_their_sigma_with_them():
@@ -21,3 +21,32 @@ def test_a_short_line_keeps_its_points_and_none_stays_none():
     assert own.tolist() == [0, 0]
     assert sigma.tolist() == [1.0, 1.0]
     assert len(averaged(uv, np.full(2, -1), sigma)[0]) == 0
+
+
+def test_a_clipped_line_is_between_its_edges_whatever_its_halo():
+    """Five times what can be shown, in a halo that is three times as bright on one side of the line as on the other."""
+    v, u = np.mgrid[:300, :400].astype(float)
+    true = 180.3 + 0.11 * v[:, 0]
+    off = u - true[:, None]
+    halo = np.where(off < 0, 30, 90) * np.exp(-np.abs(off) / 15)
+    image = np.clip(1200 * np.exp(-0.5 * (off / 5) ** 2) + halo + 5, 0, 255).astype(np.uint8)
+    rows = np.arange(2.0, 298, 3)
+    weight = np.clip(image[rows.astype(int)].astype(float) - 20, 0, None)
+    centroid = (weight * u[0]).sum(1) / weight.sum(1)
+    start = np.column_stack([centroid, rows])
+    for picture in (image, np.stack([image // 2, image, image // 3], -1)):
+        found = between_edges(picture, start)
+        wrong = [uv[:, 0] - np.interp(uv[:, 1], v[:, 0], true) for uv in (start, found)]
+        assert np.abs(wrong[0]).min() > 0.6
+        # the halo is a third of the edges' height steeper on one side; rows by themselves have the raster's error
+        assert abs(wrong[1].mean()) < 0.25
+        assert np.abs(wrong[1]).max() < 0.5
+
+
+def test_a_line_that_is_not_clipped_or_leaves_the_image_stays():
+    u = np.arange(200.0)
+    faint = np.clip(200 * np.exp(-0.5 * ((u - 90.2) / 3) ** 2), 0, 255).astype(np.uint8)
+    at_the_edge = np.where(u < 12, 255, 20).astype(np.uint8)
+    for row, at in ((faint, 90.1), (at_the_edge, 6.0)):
+        uv = np.array([[at, 10.0]])
+        assert between_edges(np.tile(row, (20, 1)), uv).tolist() == uv.tolist()

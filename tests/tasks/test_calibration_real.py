@@ -51,18 +51,20 @@ def observed(pattern: str, target: targets.Board, lines: int, grow: float):
 
 def test_etna():
     """Ten frames; the robot's poses put the squares at 10.0 mm. The plate waves by half a millimetre, the same in every
-    frame, and the light lies beside the board: taken as flat it is 0.07 squares off, with its shape 0.03."""
+    frame, and the light lies beside the board: taken as flat it is 0.075 squares off, with its shape 0.025."""
     data, corners, size = observed("etna/frame*.png", targets.Board("chessboard", 7, 6, 0.01), 1, 0.15)
     assert data.images == 10
     free = ("fx", "fy", "cx", "cy", "k1")
     camera = start.first_camera(corners, size, "brown", free)
     flat, bent = (board.calibrate_board(data, camera, free, bent=bent) for bent in (False, True))
     rms = [np.sqrt(np.nanmean(found.left_out_m**2)) for found in (flat, bent)]
-    assert 0.00005 < rms[1] < 0.00035
-    assert rms[1] < 0.6 * rms[0]
-    assert bent.corner_sigma_px < 0.1
-    for sheet in bent.left_out_sheets[:, 0]:
-        assert angle_deg(sheet[:3], bent.sheets[0][:3]) < 0.1
+    assert 0.00005 < rms[1] < 0.00026
+    assert rms[1] < 0.4 * rms[0]
+    assert bent.corner_sigma_px < 0.055
+    turned_by = sorted(angle_deg(sheet[:3], bent.sheets[0][:3]) for sheet in bent.left_out_sheets[:, 0])
+    # one frame turns the plane by 0.17 degrees, now that its light has no say in the corners' places either
+    assert turned_by[-2] < 0.1
+    assert turned_by[-1] < 0.2
 
 
 def test_lsu():
