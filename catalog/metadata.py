@@ -24,6 +24,7 @@ from ..schemas.provenance import Host, Provenance
 _SOFTWARE: Final = (
     *("seamosaic", "numpy", "scipy", "opencv-python-headless", "gtsam", "rasterio", "pyproj", "dask", "xarray"),
     *("laspy", "lazrs", "h5netcdf", "h5py", "pyogrio", "shapely", "pillow", "matplotlib"),
+    *("open3d-cpu", "open3d"),
 )
 _PROJECTION: Final = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
 _FILE: Final = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
@@ -51,7 +52,7 @@ def software_versions() -> dict[str, str]:
     for name in _SOFTWARE:
         try:
             found[name] = version(name)
-        except PackageNotFoundError:
+        except PackageNotFoundError:  # open3d's other build
             continue
     return found
 

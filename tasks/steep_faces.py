@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from . import occlusion
+from .grids import Grid
 from .mosaic import Tone
 from .nodes import BEST, Lie, Shot, quality_scale
 from .projection import departure, pixels
-from .terrain import Terrain, points_hidden
+from .terrain import Terrain
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -62,14 +64,15 @@ def charts(
     X_map: Array,
     triangles: Faces,
     terrain: Terrain,
+    own: Grid,
     views: Sequence[tuple[Shot, Lie]],
     times: dict[int, int],
     pixel_m: float,
 ) -> list[Chart]:
     """The steep faces that images show better than an orthomosaic of pixel_m does, each in one image.
 
-    X_map : (V, 3) vertices. triangles : (T, 3). terrain : what may hide them. times : by an image's number, how many
-    times smaller it is read.
+    X_map : (V, 3) vertices. triangles : (T, 3). terrain : what may hide them, besides themselves. own : the nodes that
+    the mesh was made from. times : by an image's number, how many times smaller it is read.
     """
     corners = X_map[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -78,17 +81,35 @@ def charts(
     if not len(steep) or not views:
         return []
     least = _GAIN * 0.5 * normal[steep, 2] / pixel_m**2
-    seen = [_seen(corners[steep], normal[steep], terrain, shot, lie) for shot, lie in views]
+    seen = [_seen(corners[steep], normal[steep], shot, lie) for shot, lie in views]
     shown = np.stack([found.area / times[shot.number] ** 2 for found, (shot, _) in zip(seen, views, strict=True)])
     area = np.where(shown > least, shown, 0.0)
+    # most tiles have no part that is worth it: they need no scene
+    parts = [part for part in _connected(triangles[steep]) if area[:, part].sum(1).max() >= _LEAST_PX]
+    if not parts:
+        return []
+    rest = np.ones(len(steep), bool)
+    rest[np.concatenate(parts)] = False
+    area[:, rest] = 0.0
+    view, face = np.nonzero(area)
+    C_map = np.stack([_centre(lie) for _, lie in views])
+    scene = occlusion.scene(X_map, triangles, terrain, own)
+    centre, facing = corners[steep].mean(1), normal[steep]
+    behind = occlusion.hidden(scene, centre[face], facing[face], C_map[view], own.cell_m)
+    area[view[behind], face[behind]] = 0.0
     made = []
-    for part in _connected(triangles[steep]):
-        for view, faces in _shared_out(area[:, part]):
+    for part in parts:
+        for number, faces in _shared_out(area[:, part]):
             at = part[faces]
-            if area[view, at].sum() >= _LEAST_PX:
-                found = seen[view]
-                made.append(Chart(views[view][0].number, steep[at], found.uv[at], float(found.range_m[at].mean())))
+            if area[number, at].sum() >= _LEAST_PX:
+                found = seen[number]
+                made.append(Chart(views[number][0].number, steep[at], found.uv[at], float(found.range_m[at].mean())))
     return made
+
+
+def _centre(lie: Lie) -> Array:
+    """Where the camera is (3,), map coordinates."""
+    return -np.linalg.inv(lie.A) @ lie.b
 
 
 class _Seen(NamedTuple):
@@ -99,8 +120,8 @@ class _Seen(NamedTuple):
     range_m: Array
 
 
-def _seen(corners: Array, normal: Array, terrain: Terrain, shot: Shot, lie: Lie) -> _Seen:
-    C = -np.linalg.inv(lie.A) @ lie.b
+def _seen(corners: Array, normal: Array, shot: Shot, lie: Lie) -> _Seen:
+    """Of faces (K, 3, 3) those in the image that face it, whatever is between."""
     X = corners.reshape(-1, 3) @ lie.A.T + lie.b
     ahead = X[:, 2] > 0.05
     safe = np.where(ahead[:, None], X, [0.0, 0.0, 1.0])
@@ -110,11 +131,10 @@ def _seen(corners: Array, normal: Array, terrain: Terrain, shot: Shot, lie: Lie)
     first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
     centre = corners.mean(1)
-    ray = C - centre
+    ray = _centre(lie) - centre
     range_m = np.linalg.norm(ray, axis=1)
     facing = (ray * normal).sum(1) / np.maximum(range_m * np.linalg.norm(normal, axis=1), 1e-12)
     shown = best.reshape(-1, 3).all(1) & (facing > _FACING)
-    shown[shown] = ~points_hidden(terrain, centre[shown], C)
     return _Seen(uv, np.where(shown, area, 0.0), range_m)
 
 

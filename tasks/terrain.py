@@ -119,27 +119,6 @@ def hidden(terrain: Terrain, steepest: Array, cells: Grid, C_map: Array) -> Arra
     return np.nan_to_num(resample(found, grid, cells)) if (found == 1).any() else np.zeros(cells.shape)
 
 
-def points_hidden(terrain: Terrain, X_map: Array, C_map: Array) -> NDArray[np.bool_]:
-    """Which points (N, 3) on the ground the terrain hides from a camera at C_map (3,); see `hidden`."""
-    cell = terrain.grid.cell_m
-    east, north, above = (C_map - X_map).T
-    away = np.maximum(np.hypot(east, north), 1e-9)
-    x, y = axes(terrain.grid)
-    rays = _Rays(
-        np.arange(len(X_map)),
-        (y[0] - X_map[:, 1]) / cell,
-        (X_map[:, 0] - x[0]) / cell,
-        -north / away,
-        east / away,
-        X_map[:, 2] + cell,
-        cell * above / away,
-        away / cell,
-    )
-    found = np.zeros(len(X_map), bool)
-    found[_blocked(terrain, rays)] = True
-    return found
-
-
 def _blocked(terrain: Terrain, rays: _Rays) -> NDArray[np.int64]:
     """The rays, by `cell`, that meet ground on their way."""
     top = float(np.nanmax(terrain.elevation)) if np.isfinite(terrain.elevation).any() else -np.inf

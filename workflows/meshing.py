@@ -257,7 +257,8 @@ def _with_steep_faces(
         R, C = steep.poses.R_local_camera[image.row], steep.poses.C_local[image.row]
         views.append((mosaics.shot(m.job, image, None), nodes.lie(steep.relief.local, R, C)))
     times = {row: mosaic.reduction(lens, image.range_m, steep.mosaic_cell_m) for row, image in images.items()}
-    found = steep_faces.charts(X_map, made.triangles, steep.relief, views, times, steep.mosaic_cell_m)
+    own = mesh.leaf_grid(place.column, place.row, m.cell_m)
+    found = steep_faces.charts(X_map, made.triangles, steep.relief, own, views, times, steep.mosaic_cell_m)
     size = len(ortho)
     placed = steep_faces.arranged(found, times, size, int(_MOST_SHEET * size))
     if not placed:

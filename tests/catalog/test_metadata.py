@@ -47,6 +47,7 @@ def test_software_that_can_change_a_result_is_named():
     found = metadata.software_versions()
     assert found["numpy"] == np.__version__
     assert {"seamosaic", "python", "gdal", "proj", "dask", "gtsam", "opencv-python-headless"} <= set(found)
+    assert any(name.startswith("open3d") for name in found)
     assert set(metadata.host().model_dump()) == {"platform", "cpu_count"}
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from seamosaic.schemas.calibration import Camera
-from seamosaic.tasks import nodes, steep_faces
+from seamosaic.tasks import nodes, occlusion, steep_faces
 from seamosaic.tasks.frames import LocalAffine
 from seamosaic.tasks.grids import Grid, cell_centres
 from seamosaic.tasks.terrain import Terrain
@@ -47,7 +47,7 @@ def _charts(views, z=None):
     z = _step() if z is None else z
     X, triangles = _mesh(z)
     times = {shot.number: 1 for shot, _ in views}
-    return X, triangles, steep_faces.charts(X, triangles, _terrain(z), views, times, PIXEL)
+    return X, triangles, steep_faces.charts(X, triangles, _terrain(z), GRID, views, times, PIXEL)
 
 
 def test_the_image_that_faces_a_side_shows_it():
@@ -75,11 +75,24 @@ def test_neither_the_laser_nor_what_hides_it_is_shown():
         erase[:, shape[1] // 2 :] = True  # where the side is seen from the west
         return erase
 
-    assert _charts([(_shot(0, lit), _lie(-0.9, 0))])[2] == []
+    west = _lie(-0.8, 0, 3.5)
+    assert _charts([(_shot(0), west)])[2] != []
+    assert _charts([(_shot(0, lit), west)])[2] == []
     z = _step()
-    z[:, 20:24] = 2.0  # a wall 0.8 m west of the side
-    side = [chart for chart in _charts([(_shot(0), _lie(-1.2, 0))], z)[2] if chart.uv[..., 0].max() > 1200]
-    assert side == []
+    z[:, 30:32] = 2.6  # a wall 0.45 m west of the side: its shadow ends 0.66 m east of it at 0 m, 0.41 m at 0.6 m
+    X, triangles, found = _charts([(_shot(0), west)], z)
+    assert not [chart for chart in found if (X[triangles[chart.faces], 0] > -CELL).all(1).any()]
+
+
+def test_tiles_without_steep_faces_that_images_show_do_without_a_scene(monkeypatch):
+    asked = []
+    made = occlusion.scene
+    monkeypatch.setattr(occlusion, "scene", lambda *a: asked.append(a) or made(*a))
+    _charts([(_shot(0), _lie(-0.9, 0))], np.zeros(GRID.shape))
+    _charts([(_shot(0), _lie(0.9, 0))])  # the side faces the other way
+    assert asked == []
+    assert _charts([(_shot(0), _lie(-0.8, 0, 3.5))])[2] != []
+    assert len(asked) == 1
 
 
 def test_charts_are_laid_side_by_side_and_their_faces_stay_on_them():
