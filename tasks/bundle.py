@@ -167,7 +167,19 @@ def refine(
         sigma_px, rough = _noise_px(residual_px, len(X)), laser_ranges.roughness(poses, X, ranges)
         unknowns = crossovers.LEAST_OF_IMAGE * len(np.union1d(crossed.i, crossed.j))
         bundle = Bundle(poses, block._replace(X=X, roughness=rough), residual_px, sigma_px)
-    return bundle
+    return bundle if bundle is None or navigation is None else _where_navigation_is(bundle, navigation)
+
+
+def _where_navigation_is(bundle: Bundle, navigation: NavigationPrior) -> Bundle:
+    """The whole of it moved to where navigation has it on average, in which nothing else has a say.
+
+    `reduction.solve` leaves the map as a whole where it began.
+    """
+    poses = bundle.poses
+    both = poses.known & navigation.poses.known
+    shift = (navigation.poses.C_local[both] - poses.C_local[both]).mean(0)
+    moved = poses._replace(C_local=poses.C_local + shift)
+    return bundle._replace(poses=moved, block=bundle.block._replace(X=bundle.block.X + shift))
 
 
 def determined(known: NDArray[np.bool_], sights: Sights, ranges: Ranges) -> bool:

@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 from scipy.spatial import Delaunay
 
 from .gridding import INTERPOLATED, Cells
-from .grids import Grid, cell_centres
+from .grids import Grid, cell_centres, window
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -273,10 +273,16 @@ class Holdout(NamedTuple):
     spread_m: Array
 
 
-def hold_out(grid: Grid, cells: Cells, max_distance_m: float) -> Holdout:
+def hold_out(grid: Grid, cells: Cells, max_distance_m: float, counted: Grid | None = None) -> Holdout:
     """What interpolation does to soundings that it does not know: squares of them are left out, an eighth at a
     time, with sides of 1/16, 1/8, 1/4 and 1/2 of the largest distance. Feed `fit_growth` with those of some tiles.
+
+    counted : the part of the grid whose cells count, so that tiles give what the whole map would.
     """
+    inside = np.ones(grid.shape, bool)
+    if counted is not None:
+        inside[:] = False
+        inside[window(grid, counted)] = True
     row, column = np.mgrid[grid.top : grid.top - grid.height : -1, grid.left : grid.left + grid.width]
     found = []
     for k, share in enumerate((16, 8, 4, 2)):
@@ -286,7 +292,9 @@ def hold_out(grid: Grid, cells: Cells, max_distance_m: float) -> Holdout:
         rest = cells._replace(density=np.where(out, np.int32(0), cells.density))
         reach = _reach(grid, rest, out, max_distance_m)
         z, _, spread = _interpolated(rest, reach)
-        found.append((np.abs(z - cells.elevation.ravel()[reach.cell]), reach.distance, spread))
+        here = inside.ravel()[reach.cell]
+        error = np.abs(z - cells.elevation.ravel()[reach.cell])
+        found.append((error[here], reach.distance[here], spread[here]))
     return Holdout(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 

@@ -133,7 +133,8 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
     def make() -> Made:
         halos = [_halo(m, sample.tile) for sample in samples]
         cells = [_cells(m.job, halo, sample.neighbours) for halo, sample in zip(halos, samples, strict=True)]
-        held = [_hold_out(m, *each) for each in zip(samples, halos, cells, strict=True)]
+        reach = m.max_interpolation_m
+        held = [surface.hold_out(h, c, reach, s.tile) for s, h, c in zip(samples, halos, cells, strict=True)]
         law = surface.fit_growth(surface.Holdout(*(np.concatenate(column) for column in zip(*held, strict=True))))
         sigma = [np.zeros(0)]
         for sample, halo, known in zip(samples, halos, cells, strict=True):
@@ -148,11 +149,6 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
     inputs.append(array_digest(*(np.round(sample.outlines, 3) for sample in samples)))
     parameters = [m.max_interpolation_m, m.max_sigma_m, m.least_seen, [list(sample.tile) for sample in samples]]
     return once(m.job, GROWTH, _VERSION, inputs, parameters, make)
-
-
-def _hold_out(m: MapJob, sample: Sample, halo: Grid, cells: Cells) -> surface.Holdout:
-    inner = grids.window(halo, sample.tile)
-    return surface.hold_out(sample.tile, Cells._make(values[inner] for values in cells), m.max_interpolation_m)
 
 
 def _halo(m: MapJob, tile: Grid) -> Grid:
