@@ -116,7 +116,7 @@ def run(
         return RunResult(newest.path, False, quality, ())
     store = Store(f"{out}/{mission_id}/steps")
     with (
-        nullcontext() if leased else leases.take(out, mission_id, shared=True),
+        nullcontext() if leased else _lease(out, mission_id),
         _footing(store, opened, out) as footing,
         open_executor(scheduler, workers, cluster) as executor,
     ):
@@ -154,6 +154,11 @@ def _process(state: Session, asked: Request, out: str) -> RunResult:
 
 def _absolute(url: str | Path) -> str:
     return str(url).rstrip("/") if is_remote(url) else str(place(url).resolve())
+
+
+def _lease(out: str, mission_id: str) -> leases.Lease:
+    with _reaching(out):
+        return leases.take(out, mission_id, shared=True)
 
 
 @contextmanager

@@ -153,15 +153,15 @@ def test_textures_of_the_mesh_are_made_as_small_as_asked(reef, tmp_path):
 
 def test_a_mission_too_large_for_one_file_is_a_coarser_level_of_its_pyramid():
     finest = list(meshing.leaves(Grid(0.02, -300, 900, 1500, 1200)))
-    assert len(finest) == 8 * 6
+    assert len(finest) == 7 * 6
     levels = meshing.levels(finest)
-    assert [len(level) for level in levels] == [48, 12, 4]
+    assert [len(level) for level in levels] == [42, 12, 6, 4]
     pyramid = {
         place: Done("mesh", str(place), True, 0.0, {"triangles": 9000, "vertices": 5000, "error_m": 0.01})
         for level in levels
         for place in level
     }
-    assert [mesh_products.level_of_file(pyramid, most) for most in (500_000, 108_000, 40_000, 10)] == [0, 1, 2, 2]
+    assert [mesh_products.level_of_file(pyramid, most) for most in (378_000, 377_999, 60_000, 10)] == [0, 1, 2, 3]
 
 
 def test_contours_of_the_survey_lie_on_the_bathymetry(reef):
