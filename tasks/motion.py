@@ -5,7 +5,7 @@ which that plane makes metric; elsewhere from the essential matrix, made metric 
 triangulated depths over all features near soundings. Image points are slopes (x/z, y/z) in the camera frame.
 """
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -336,7 +336,8 @@ def _minimise_sampson(x_i: Array, x_j: Array, R: Array, t: Array, focal_px: floa
         found = at(step + np.concatenate([np.zeros((1, 6)), _SMALL_STEP * np.eye(6)]))
         return (found[1:] - found[0]).T / _SMALL_STEP
 
-    return least_squares(lambda step: at(step[None])[0], np.zeros(6), jacobian, loss="huber", f_scale=2.0, ftol=_ENOUGH)
+    by_step = cast(Any, jacobian)  # scipy's types know no functions there
+    return least_squares(lambda step: at(step[None])[0], np.zeros(6), by_step, loss="huber", f_scale=2.0, ftol=_ENOUGH)
 
 
 def _epipolar_covariance(solution: Any, scale_sigma: float, with_prior: bool) -> Array:
