@@ -70,7 +70,7 @@ def between_edges(image: NDArray[np.uint8], uv: Array) -> Array:
 
     A line that outshines the sensor keeps its two steep edges, and nothing between them. The glare beside them is
     uneven, a third as bright as what can be shown and much wider, so that it draws any centroid to one side by a third
-    of a pixel; the edges it moves by a tenth of that.
+    of a pixel; the edges it moves by a third of that.
 
     Parameters
     ----------
