@@ -100,7 +100,10 @@ def adjust(
         sigma_m, sigma_tilt = sigmas(_covariances(found, navigation, p), found.poses, navigation)
     except RuntimeError:  # GTSAM: a system too near to singular, which counting alone cannot foresee
         return chained
-    rms_px = float(np.sqrt((found.residual_px**2).sum(1).mean())) if len(found.residual_px) else None
+    # a tie point that ended behind a camera is a wrong match that nothing is left of
+    ahead = np.isfinite(found.residual_px).all(1)
+    sights, left_px = Sights(*(column[ahead] for column in found.block.sights)), found.residual_px[ahead]
+    rms_px = float(np.sqrt((left_px**2).sum(1).mean())) if len(left_px) else None
     count = len(chained.status)
     held = _by_laser(found, lines, count)
     return chained._replace(
@@ -108,7 +111,7 @@ def adjust(
         sigma_m=sigma_m,
         sigma_tilt_rad=sigma_tilt,
         reprojection_px=rms_px,
-        residuals=remaining.of(count, found.block.sights, found.residual_px, found.block.crossed),
+        residuals=remaining.of(count, sights, left_px, found.block.crossed),
         status=["adjusted" if ok else status for status, ok in zip(chained.status, held, strict=True)],
     )
 
