@@ -15,10 +15,6 @@ def run_name() -> str:
     return f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
 
 
-def is_run_name(name: str) -> bool:
-    return _NAME.fullmatch(name) is not None
-
-
 def is_dead(name: str, quiet_s: float) -> bool:
     """Whether the process that gave a name is gone from this host, or, on any host, silent for the lease.
 

@@ -19,7 +19,6 @@ Array = NDArray[np.float64]
 _REACH_SIGMAS = 3.3
 _LEAST_NEAR = 8
 _MOST_ALIKE = 0.95  # correlation of neighbours beyond which a line is too short to tell
-_BESIDE_PX = 20.0
 
 
 class Soundings(NamedTuple):
