@@ -93,6 +93,7 @@ def _item(entry: MissionEntry, version: Version, newest: bool) -> pystac.Item:
     """The item that the run wrote, with its place in the catalogue; one without a geometry if there is none."""
     value = json_files.read_json(f"{version.path}/metadata/stac-item.json")
     item = pystac.Item.from_dict(value) if isinstance(value, dict) else _placeless(entry, version)
+    item.id = f"{entry.id}-v{version.number}"  # the run that wrote it could only guess its number
     for asset in item.assets.values():
         asset.href = f"../v{version.number}/{asset.href.removeprefix('../')}"
     item.properties |= {"version": str(version.number), "deprecated": not newest}

@@ -18,7 +18,16 @@ from .filesystems import Folder, place
 from .publishing import PROVENANCE, digest_of
 from .runs import LEASE_S, is_dead, run_name
 
-__all__ = ["LEASE_S", "PROVENANCE", "Version", "VersionWriter", "list_versions", "new_version", "newest_version"]
+__all__ = [
+    "LEASE_S",
+    "PROVENANCE",
+    "Version",
+    "VersionWriter",
+    "list_versions",
+    "new_version",
+    "newest_version",
+    "next_number",
+]
 
 _VERSION: Final = re.compile(r"v([1-9][0-9]*)")
 _UNFINISHED, _STAGED = ".new-", "seamosaic-new-"
@@ -51,6 +60,12 @@ def newest_version(out_dir: str | os.PathLike[str], mission_id: str) -> Version 
     """The version with the highest number."""
     found = list_versions(out_dir, mission_id)
     return found[-1] if found else None
+
+
+def next_number(out_dir: str | os.PathLike[str], mission_id: str) -> int:
+    """The number that the next version gets, unless another run is faster."""
+    newest = newest_version(out_dir, mission_id)
+    return newest.number + 1 if newest else 1
 
 
 class VersionWriter:
@@ -98,7 +113,7 @@ class VersionWriter:
         newest = newest_version(self._out, self._mission)
         if newest is not None and newest.digest == self._digest:
             return Path(str(newest.path))
-        number = newest.number + 1 if newest else 1
+        number = next_number(self._out, self._mission)
         while True:
             path = folder / f"v{number}"
             try:

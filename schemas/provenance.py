@@ -68,4 +68,7 @@ class Provenance(Model):
     request: Annotated[
         Request | None, Field(description="absent where an image could not be read just then: the next run looks again")
     ] = None
+    parts: Annotated[
+        dict[str, Sha256], Field(description="group of files to what it was made from; the next version may share it")
+    ] = Field(default_factory=dict)
     outputs: dict[str, Sha256] = Field(default_factory=dict, description="path in the version's folder to SHA-256")

@@ -46,7 +46,7 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst, enough)
     outlines = _outlines(state, posed.solution, ranges)
     # what is costly does not change with the bathymetry's cell: matching is kept as fine as either of the cells, and
-    # mosaics lie on a surface of their own
+    # mosaics and mesh lie on a surface of their own
     usual = grids.bathymetry_cell_m(gsd)
     linked, agreed = _dense(state, m._replace(cell_m=min(cell, usual)), posed, images, outlines, ranges)
     surface_tiles = _surface(state, m, linked, agreed, images, outlines)
@@ -56,8 +56,8 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     textured = [image for image in images if image.texture]
     light = _lighting(state, below, textured)
     mosaic = _mosaics(state, below, textured or images, outlines, ground, mosaic_cell, light, posed)
-    pyramid = _mesh(state, m, textured, outlines, surface_tiles, mosaic, light)
-    return Mapped(m, cell, mosaic_cell, surface_tiles, terrain, mosaic, pyramid, outlines)
+    pyramid = _mesh(state, below, textured, outlines, ground, mosaic, light)
+    return Mapped(m, cell, mosaic_cell, surface_tiles, terrain, ground, mosaic, pyramid, outlines)
 
 
 def _images(state: Session, posed: Posed, ranges: np.ndarray) -> list[Image]:

@@ -22,7 +22,7 @@ _FOLDER = "mesh-3dtiles"
 def write(results: Results, folder: Path, crs_wkt: str) -> MeshQuality:
     """All three; what they came to."""
     pyramid, mapped = results.mapped.mesh, results.mapped
-    west, _, _, north = mapped.surface.grid.bounds
+    west, _, _, north = mapped.ground.grid.bounds
     origin = np.array([west, north, 0.0])
     about = {"crs": crs_wkt, "offset": origin.tolist()}
     _write_tiles(results, folder / _FOLDER, None if results.opened.crs is None else crs_wkt, origin, about)
@@ -77,7 +77,7 @@ def _part(results: Results, place: Place, done: Done, origin: np.ndarray, shrink
     normals = np.column_stack([-x, -y, np.ones(len(x))])
     texture = arrays["texture"]
     return Part(
-        vertex_positions(place, arrays["nodes"], arrays["heights"], results.mapped.cell_m) - origin,
+        vertex_positions(place, arrays["nodes"], arrays["heights"], results.mapped.ground.grid.cell_m) - origin,
         normals / np.linalg.norm(normals, axis=1, keepdims=True),
         arrays["triangles"],
         arrays["uv"],

@@ -32,14 +32,15 @@ from . import (
     report,
     report_figures,
     residual_quality,
+    unchanged,
 )
-from .job import code_version, load
+from .job import Done, code_version, load, stage
 from .results import Results, span, vertical_reference
 from .solve import Solution
 
 DECIDING = (
     *(sys.modules[__name__], report_figures, meshes, metadata, netcdf, pointclouds, rasters, trajectories, vectors),
-    *(contours, mesh_products, tiles3d, report, quality, calibration_quality, residual_quality),
+    *(contours, mesh_products, tiles3d, report, quality, calibration_quality, residual_quality, unchanged),
 )
 VERSION = code_version(*DECIDING)
 
@@ -62,15 +63,21 @@ def write(results: Results) -> tuple[Folder, bool, Quality]:
 
 
 def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
-    crs_wkt = _product_crs(results.opened)
+    crs_wkt, before = _product_crs(results.opened), unchanged.newest(results.out, results.job.mission_id)
+    parts = _parts(results, crs_wkt)
     rows, navigation = _trajectory(results)
     trajectories.write(folder / "trajectory.csv", rows)
     _write_bathymetry(results, folder, crs_wkt)
     _write_terrain(results, folder, crs_wkt)
-    _write_mosaics(results, folder, crs_wkt)
-    count = _write_soundings(results, folder, crs_wkt)
-    triangles = mesh_products.write(results, folder, crs_wkt)
+    if not unchanged.take(before, folder, "mosaics", parts["mosaics"]):
+        _write_mosaics(results, folder, crs_wkt)
+    if not unchanged.take(before, folder, "soundings", parts["soundings"]):
+        _write_soundings(results, folder, crs_wkt)
+    triangles = before.quality.mesh if before else None
+    if triangles is None or not unchanged.take(before, folder, "mesh", parts["mesh"]):
+        triangles = mesh_products.write(results, folder, crs_wkt)
     _write_survey(results, folder, crs_wkt, rows)
+    count = sum(done.info["soundings"] for done, _ in _sounded(results))
     figures = quality.figures(results, folder, rows, navigation, count, triangles)
     metadata.write_quality(folder / "quality.json", figures)
     provenance = _provenance(results, made_from)
@@ -78,12 +85,23 @@ def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
     if results.opened.crs is not None:
         start, end = span(results.opened)
         mission = results.opened.mission
-        newest = versions.newest_version(results.out, mission.id)
-        number = newest.number + 1 if newest else 1
+        number = versions.next_number(results.out, mission.id)
         metadata.write_stac_item(folder, mission.id, number, mission.title, start, end, _about(mission))
-    provenance = provenance.model_copy(update={"outputs": metadata.output_digests(folder)})
+    provenance = provenance.model_copy(update={"parts": parts, "outputs": metadata.output_digests(folder)})
     metadata.write_provenance(folder / "metadata" / "provenance.json", provenance)
     return figures
+
+
+def _parts(results: Results, crs_wkt: str) -> dict[str, str]:
+    """What each group of files that versions may share is made from."""
+    job, mapped, posed = results.job, results.mapped, results.posed
+    common = [VERSION, memory.inputs_digest(results.opened), crs_wkt]
+    made = {
+        "mosaics": [done.key for _, done in mapped.mosaic.tiles],
+        "soundings": [posed.adjusted.key, *(done.key for done in posed.extracted.values())],
+        "mesh": [done.key for done in mapped.mesh.values()],
+    }
+    return {part: digest(part, VERSION, [*common, *keys], stage(job.parameters.mesh)) for part, keys in made.items()}
 
 
 def _about(mission: Mission) -> dict[str, str]:
@@ -211,23 +229,25 @@ def _write_mosaics(results: Results, folder: Path, crs_wkt: str) -> None:
             planar.write(*place, arrays["planar_rgb"], arrays["planar_mask"])
 
 
-def _write_soundings(results: Results, folder: Path, crs_wkt: str) -> int:
-    """Every accepted laser point of the images that have a pose; how many."""
-    grid, poses = results.mapped.surface.grid, results.posed.solution.poses
-    west, south, _, _ = grid.bounds
-    count, status = 0, _status(results)
-    error = calibration_quality.of_calibration(results.job)
+def _sounded(results: Results) -> Iterator[tuple[Done, int]]:
+    """Extractions with soundings, and their rows, of the images that have a pose."""
+    status = _status(results)
+    for row, done in results.posed.extracted.items():
+        if done.info["soundings"] and not status[row].startswith("rejected"):
+            yield done, row
+
+
+def _write_soundings(results: Results, folder: Path, crs_wkt: str) -> None:
+    """Every accepted laser point of the images that have a pose."""
+    poses, error = results.posed.solution.poses, calibration_quality.of_calibration(results.job)
+    west, south = np.floor(np.nanmin(results.mapped.outlines.reshape(-1, 2), axis=0))
     with pointclouds.SoundingsWriter(folder / "soundings.laz", crs_wkt, np.array([west, south, 0.0])) as file:
-        for row, done in results.posed.extracted.items():
-            if status[row].startswith("rejected") or not done.info["soundings"]:
-                continue
+        for done, row in _sounded(results):
             arrays = load(results.job, extract.STEP, done.key).arrays
             X = arrays["laser_X"] @ poses.R_local_camera[row].T + poses.C_local[row]
             frame = np.full(len(X), row, np.int32)
             sigma = np.hypot(arrays["laser_sigma"], calibration_quality.soundings_sigma(error, dict(arrays)))
             file.write(results.plan.frame.map_from_local(X), frame, arrays["laser_arm"], sigma)
-            count += len(X)
-    return count
 
 
 def _write_survey(results: Results, folder: Path, crs_wkt: str, rows: Sequence[trajectories.Row]) -> None:

@@ -41,13 +41,18 @@ class TerrainLayers(NamedTuple):
 
 
 class Mapped(NamedTuple):
-    """Results of the map tiles. outlines : (n, M, 2) footprints in map coordinates."""
+    """Results of the map tiles.
+
+    ground : the surface under mosaics and mesh, whose cells do not depend on `grid.cell_m`.
+    outlines : (n, M, 2) footprints in map coordinates.
+    """
 
     map_job: MapJob
     cell_m: float
     mosaic_cell_m: float
     surface: Tiles
     terrain: TerrainLayers
+    ground: Tiles
     mosaic: Tiles
     mesh: dict[Place, Done]
     outlines: np.ndarray

@@ -26,7 +26,7 @@ from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.products import PRODUCTS
 from seamosaic.tasks import derivatives
 from seamosaic.tasks.grids import Grid
-from seamosaic.workflows import mesh_products, meshing
+from seamosaic.workflows import mesh_products, meshing, products
 from seamosaic.workflows.evaluate import evaluate
 from seamosaic.workflows.job import Done
 from seamosaic.workflows.mapping import NothingToMap
@@ -230,13 +230,16 @@ def test_a_second_run_computes_nothing_and_makes_no_version(reef):
     assert (again.path, again.new) == (reef.result.path, False)
 
 
-def test_another_cell_size_recomputes_the_maps_only(reef, tmp_path):
+def test_another_cell_size_makes_the_bathymetry_only(reef, tmp_path, monkeypatch):
+    """Mosaics, mesh and soundings are those of the version before, file by file."""
     out = tmp_path / "out"
     shutil.copytree(reef.out, out)
+    for owner, name in ((products, "_write_mosaics"), (products, "_write_soundings"), (mesh_products, "write")):
+        monkeypatch.setattr(owner, name, None)
     parameters = Parameters.model_validate({"grid": {"cell_m": 0.05}})
     result = run(str(reef.mission), out, parameters, scheduler="sync")
     computed = _computed(result)
-    kept = ("extract", "match", "adjust", "dense", "agreement", "lighting", "planar-align", "mosaic")
+    kept = ("extract", "match", "adjust", "dense", "agreement", "lighting", "planar-align", "mosaic", "mesh")
     assert {step: computed[step] for step in kept} == dict.fromkeys(kept, 0)
     assert computed["cells"] > 0
     assert result.path.name == "v2"
@@ -246,6 +249,11 @@ def test_another_cell_size_recomputes_the_maps_only(reef, tmp_path):
     ):
         assert (new.res[0], old.res[0]) == (0.05, reef.result.quality.bathymetry.cell_m)
         assert abs(round(new.bounds.left / 0.05) * 0.05 - new.bounds.left) < 1e-6
+    old, new = (json.loads((path / "metadata/provenance.json").read_text()) for path in (reef.result.path, result.path))
+    shared = {name for name in old["outputs"] if old["outputs"][name] == new["outputs"].get(name)}
+    assert {"mosaic.tif", "mosaic-planar.tif", "mesh.glb", "mesh-3dtiles/tileset.json", "soundings.laz"} <= shared
+    assert "bathymetry.tif" not in shared
+    assert result.quality.mesh == reef.result.quality.mesh
 
 
 def test_what_the_calibration_leaves_open_is_in_every_sigma(reef, tmp_path):
