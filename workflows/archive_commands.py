@@ -177,8 +177,8 @@ def reprocess(
 
 
 def compare(
-    first: Annotated[Path, typer.Argument(metavar="V1", help="A version's folder.")],
-    second: Annotated[Path, typer.Argument(metavar="V2", help="Another version of the same place.")],
+    first: Annotated[str, typer.Argument(metavar="V1", help="A version's folder or URL.")],
+    second: Annotated[str, typer.Argument(metavar="V2", help="Another version of the same place.")],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="FOLDER", help="For difference maps and a report.")
     ] = None,

@@ -1,8 +1,9 @@
 """`seamosaic compare V1 V2`: where and by how much two versions differ, and in what they were made differently."""
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -13,6 +14,7 @@ from rasterio import DatasetReader
 from rasterio.windows import Window
 
 from ..catalog import rasters, trajectories, versions
+from ..catalog.filesystems import Folder, asking, place
 from ..catalog.rasters import NODATA_M, Layer, RasterWriter
 from ..catalog.trajectories import Row
 from ..schemas.problems import InvalidInput, Problem
@@ -30,22 +32,23 @@ _MAPS: Final = {"difference.tif": _METRES, "difference-sigmas.tif": _SIGMAS}
 
 
 class _Side(NamedTuple):
-    """A version: its folder, its grid, its rasters and its provenance."""
+    """A version: where it is, its grid, its rasters, its trajectory and its provenance."""
 
-    folder: Path
+    folder: Folder
     grid: Grid
     crs_wkt: str
     elevation: DatasetReader
     sigma: DatasetReader
+    trajectory: list[Row]
     made: dict[str, Any]
 
 
-def compare(first: Path, second: Path, out: Path | None = None) -> dict[str, Any]:
+def compare(first: str | Path, second: str | Path, out: Path | None = None) -> dict[str, Any]:
     """Compare two versions of one place.
 
     Parameters
     ----------
-    first, second : folders of versions.
+    first, second : folders of versions, or URLs that fsspec reads.
     out : folder for difference.tif and difference-sigmas.tif, compare.json and compare.html; None for figures only.
 
     Returns
@@ -67,7 +70,7 @@ def compare(first: Path, second: Path, out: Path | None = None) -> dict[str, Any
             "second": str(second),
             "cell_m": sides[0].grid.cell_m,
             "bathymetry": _bathymetry(*sides, out),
-            "trajectory": _trajectory(*(trajectories.read(side.folder / "trajectory.csv") for side in sides)),
+            "trajectory": _trajectory(*(side.trajectory for side in sides)),
             **_made_differently(*(side.made for side in sides)),
         }
     if out is not None:
@@ -76,23 +79,38 @@ def compare(first: Path, second: Path, out: Path | None = None) -> dict[str, Any
     return found
 
 
-def _wrong(path: Path, key: str, found: str, expected: str, remedy: str) -> InvalidInput:
+def _wrong(path: Folder, key: str, found: str, expected: str, remedy: str) -> InvalidInput:
     return InvalidInput([Problem(str(path), None, key, found, expected, remedy)])
 
 
-def _open(folder: Path, opened: ExitStack) -> _Side:
+def _open(url: str | Path, opened: ExitStack) -> _Side:
     names = "bathymetry.tif", "uncertainty.tif", "trajectory.csv", versions.PROVENANCE
-    missing = [name for name in names if not (folder / name).is_file()]
+    folder = place(url)
+    local = _local(folder, names, opened)
+    missing = [name for name in names if not (local / name).is_file()]
     if missing:
         remedy = "Give two folders such as products/<mission id>/v1 and v2."
         raise _wrong(folder, "", f"no {missing[0]}", "a version's folder", remedy)
     opened.enter_context(rasters.gdal_settings())
-    elevation, sigma = (opened.enter_context(rasterio.open(folder / name)) for name in names[:2])
+    elevation, sigma = (opened.enter_context(rasterio.open(local / name)) for name in names[:2])
     cell = abs(elevation.transform.a)
     left, top = round(elevation.transform.c / cell), round(elevation.transform.f / cell)
     grid = Grid(round(cell, 9), left, top, elevation.width, elevation.height)
-    made = json.loads((folder / versions.PROVENANCE).read_text(encoding="utf-8"))
-    return _Side(folder, grid, elevation.crs.to_wkt(), elevation, sigma, made)
+    made = json.loads((local / versions.PROVENANCE).read_text(encoding="utf-8"))
+    trajectory = trajectories.read(local / "trajectory.csv")
+    return _Side(folder, grid, elevation.crs.to_wkt(), elevation, sigma, trajectory, made)
+
+
+def _local(folder: Folder, names: Sequence[str], opened: ExitStack) -> Path:
+    """Where the files that are wanted, of those that are there, can be opened as long as the context lasts."""
+    if isinstance(folder, Path):
+        return folder
+    local = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="seamosaic-compare-")))
+    for name in names:
+        (local / name).parent.mkdir(exist_ok=True)
+        with asking(folder.fs, f"{folder}/{name}"), suppress(FileNotFoundError):
+            folder.fs.get_file((folder / name).path, str(local / name))
+    return local
 
 
 def _check_fit(first: _Side, second: _Side) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pyproj
 import pytest
 import rasterio
+import s3fs
 from rio_cogeo import cog_validate
 from seamosaic.catalog import rasters, trajectories, versions
 from seamosaic.catalog.trajectories import Pose, Row
@@ -41,6 +42,20 @@ def pose(k, shift_m):
 @pytest.fixture
 def seabed():
     return np.random.default_rng(0).normal(-8, 0.1, (60, 80))
+
+
+def test_versions_on_an_object_store(tmp_path, seabed, s3):
+    first, second = make_version(tmp_path / "v1", seabed), make_version(tmp_path / "v2", seabed + 0.01)
+    local = compare(first, second)
+    for folder in (first, second):
+        s3fs.S3FileSystem().put(str(folder), f"{s3.bucket}/compared/{folder.name}", recursive=True)
+    urls = [s3.url(f"compared/{name}") for name in ("v1", "v2")]
+    remote = compare(*urls, tmp_path / "out")
+    assert remote == {**local, "first": urls[0], "second": urls[1]}
+    with rasterio.open(tmp_path / "out/difference.tif") as file:
+        assert file.tags()["SECOND"] == urls[1]
+    with pytest.raises(InvalidInput, match=r"no bathymetry\.tif"):
+        compare(urls[0], s3.url("compared/v3"))
 
 
 def test_a_known_difference_comes_back_on_shifted_grids(tmp_path, seabed):
