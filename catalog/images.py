@@ -1,6 +1,10 @@
 """Decoded images."""
 
 import io
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Final, NamedTuple, cast
 
 import cv2
@@ -71,15 +75,37 @@ def read_image(mission: str, image: str, camera: Camera, reduce: int = 1) -> Dec
     ObjectStoreError
         If the object store does not give it: no fault of the image.
     """
+    content = read_file(mission, image)
+    return DecodedImage(decode(content, camera, reduce), sha256(content))
+
+
+def read_file(mission: str, image: str) -> bytes:
+    """The bytes of an image's file. Raises MissingImage and ObjectStoreError as `read_image` does."""
     fs, root = connect(mission)
     try:
         with asking(fs, f"{mission}/{image}"):
-            content = cast(bytes, fs.cat_file(f"{root.rstrip('/')}/{image}"))
+            return cast(bytes, fs.cat_file(f"{root.rstrip('/')}/{image}"))
     except ObjectStoreError:
         raise
     except OSError as error:
         raise MissingImage(f"{image} cannot be read ({error.strerror or error})") from error
-    return DecodedImage(decode(content, camera, reduce), sha256(content))
+
+
+@contextmanager
+def reading_ahead(mission: str, images: Sequence[str]) -> Iterator[Callable[[str], bytes]]:
+    """A `read_file` for images of a list: while one is worked on, the next is being read by another thread."""
+    following = dict(itertools.pairwise(images))
+    with ThreadPoolExecutor(1) as reader:
+        begun: dict[str, Future[bytes]] = {}
+
+        def read(image: str) -> bytes:
+            waiting = begun.pop(image, None)
+            content = waiting.result() if waiting else read_file(mission, image)
+            if (after := following.get(image)) is not None:
+                begun[after] = reader.submit(read_file, mission, after)
+            return content
+
+        yield read
 
 
 def decode(content: bytes, camera: Camera, reduce: int = 1) -> NDArray[np.uint8]:

@@ -2,13 +2,14 @@
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from ..catalog.images import MissingImage, UnreadableImage, read_image
+from ..catalog import digests
+from ..catalog.images import MissingImage, UnreadableImage, decode, read_file, reading_ahead
 from ..schemas.calibration import Laser
 from ..schemas.mission import Role
 from ..tasks import colour, features, laser, triangulation
@@ -39,10 +40,11 @@ class ImageTask(NamedTuple):
 def extract_batch(job: Job, batch: Sequence[ImageTask]) -> list[Done]:
     """Extract some images; a bad one gives an entry that says why, never an exception."""
     cv2.setNumThreads(1)
-    return [_extract(job, image) for image in batch]
+    with reading_ahead(job.mission_url, [image.path for image in batch]) as read:
+        return [_extract(job, image, read) for image in batch]
 
 
-def _extract(job: Job, image: ImageTask) -> Done:
+def _extract(job: Job, image: ImageTask, read: Callable[[str], bytes]) -> Done:
     calibration = job.calibration
     light = calibration.laser if image.role != "texture" else None
     parameters = [
@@ -54,7 +56,7 @@ def _extract(job: Job, image: ImageTask) -> Done:
 
     def make() -> Made:
         try:
-            bgr = read_verified(job, image.path, image.sha256)
+            bgr = _verified(job, image.path, image.sha256, read(image.path))
         except UnreadableImage as error:
             return Made({}, _rejected(error))
         return _measure(job, image, light, bgr)
@@ -81,10 +83,13 @@ def read_verified(job: Job, path: str, sha256: str, reduce: int = 1) -> np.ndarr
     ObjectStoreError
         The object store does not give it.
     """
-    decoded = read_image(job.mission_url, path, job.calibration.camera, reduce)
-    if decoded.sha256 != sha256:
+    return _verified(job, path, sha256, read_file(job.mission_url, path), reduce)
+
+
+def _verified(job: Job, path: str, expected: str, content: bytes, reduce: int = 1) -> np.ndarray:
+    if digests.sha256(content) != expected:
         raise MissingImage(f"{path} changed while the mission was being processed; run again")
-    return decoded.bgr
+    return decode(content, job.calibration.camera, reduce)
 
 
 def _measure(job: Job, image: ImageTask, light: Laser | None, bgr: np.ndarray) -> Made:

@@ -1,4 +1,5 @@
 import hashlib
+import threading
 from pathlib import Path
 
 import cv2
@@ -6,7 +7,8 @@ import fsspec
 import numpy as np
 import pytest
 from PIL import Image
-from seamosaic.catalog.images import UnreadableImage, decode, read_image
+from seamosaic.catalog import images
+from seamosaic.catalog.images import MissingImage, UnreadableImage, decode, read_file, read_image, reading_ahead
 from seamosaic.schemas.calibration import Camera
 
 CAMERA = Camera(model="brown", width=96, height=64, fx=100, fy=100, cx=47.5, cy=31.5)
@@ -100,3 +102,32 @@ def test_another_size_is_refused(smooth: np.ndarray) -> None:
 def test_a_missing_file_is_no_fault_of_the_image(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"nowhere.jpg cannot be read"):
         read_image(str(tmp_path), "nowhere.jpg", CAMERA)
+
+
+def test_the_next_image_is_read_while_one_is_worked_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in "abc":
+        (tmp_path / name).write_bytes(name.encode())
+    begun = {name: threading.Event() for name in "abc"}
+
+    def announced(mission: str, image: str) -> bytes:
+        begun[image].set()
+        return read_file(mission, image)
+
+    monkeypatch.setattr(images, "read_file", announced)
+    with reading_ahead(str(tmp_path), ["a", "b", "c"]) as read:
+        assert not begun["a"].is_set()
+        assert read("a") == b"a"
+        assert begun["b"].wait(30)  # nobody has asked for it
+        assert not begun["c"].is_set()
+        assert read("c") == b"c"  # in whatever order
+        assert read("b") == b"b"
+
+
+def test_reading_ahead_says_of_which_image_it_failed(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"a")
+    with reading_ahead(str(tmp_path), ["a", "gone", "b"]) as read:
+        assert read("a") == b"a"
+        with pytest.raises(MissingImage, match="gone cannot be read"):
+            read("gone")
+        with pytest.raises(MissingImage, match="b cannot be read"):
+            read("b")

@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from seamosaic.catalog import memory, missions, records
+from seamosaic.catalog import images, memory, missions, records
 from seamosaic.catalog.images import MissingImage
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.workflows import job, products, request, run
@@ -80,15 +80,15 @@ def test_other_software_that_comes_to_the_same_is_looked_at_once(reef, tmp_path,
 
 
 def test_an_image_that_could_not_be_read_just_then_is_tried_again(reef, tmp_path, monkeypatch):
-    out, read = tmp_path / "out", run.extract.read_image
+    out, read = tmp_path / "out", images.read_file
 
-    def once_broken(url, path, *rest):
+    def once_broken(url, path):
         if path.endswith(first):
             raise MissingImage("the disk is tired")
-        return read(url, path, *rest)
+        return read(url, path)
 
     first = sorted((reef.mission / "images").iterdir())[0].name
-    monkeypatch.setattr(run.extract, "read_image", once_broken)
+    monkeypatch.setattr(images, "read_file", once_broken)
     broken = run.run(str(reef.mission), out, Parameters(), scheduler="sync")
     assert (broken.quality.trajectory.rejected, broken.request) == (1, None)
     monkeypatch.undo()
