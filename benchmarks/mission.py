@@ -44,12 +44,12 @@ def each_image_anew() -> None:
     """Extractions are stored by the image's name too, so that one file under many names is many images."""
     original, once = extract._extract, extract.once
 
-    def named(job: Any, image: extract.ImageTask) -> Any:
+    def named(job: Any, image: extract.ImageTask, read: Any) -> Any:
         def once_a_name(job: Any, step: str, code: str, inputs: list[str], parameters: Any, make: Any) -> Any:
             return once(job, step, code, [*inputs, image.path], parameters, make)
 
         extract.once = once_a_name
-        return original(job, image)
+        return original(job, image, read)
 
     extract._extract = named
 
