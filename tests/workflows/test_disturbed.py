@@ -242,7 +242,7 @@ def test_an_object_store_that_errs_and_one_that_fails(mission, calm, s3, tmp_pat
     with s3.misbehaving(down=True):
         _, said = process.communicate(timeout=4 * PATIENCE_S)
     assert process.returncode == 1
-    assert "unwell" in said
+    assert "unwell" in said or "Internal Server Error" in said  # which answers to HEAD, without a body, are
     assert not [path for path in fs.find(f"{s3.bucket}/disturbed-out") if "/v1/" in path]
     assert finish(url, out, "--scheduler", "threads").returncode == 0
     fs.get(f"{s3.bucket}/disturbed-out/{ID}/v1", str(tmp_path / "again"), recursive=True)
