@@ -18,6 +18,7 @@ from ..tasks.frames import MapFrame
 from ..tasks.grids import bathymetry_cell_m, mosaic_cell_m
 from ..tasks.navigation import VehicleState, camera_poses
 from ..tasks.pairs import footprints
+from . import memory_need
 
 
 class Coverage(NamedTuple):
@@ -108,8 +109,12 @@ def _plan(opened: OpenedMission, parameters: Parameters) -> list[tuple[str, str]
         ("laser", "yes" if opened.calibration.laser is not None else "no: heights come from image matching alone"),
         ("navigation", _navigation(opened)),
         ("map", _map(opened)),
-        *_cells(coverage(opened), parameters),
+        *_cells(seen := coverage(opened), parameters),
     ]
+    if seen is not None:
+        found = memory_need.needs(opened.calibration.camera, parameters, int(counts.sum()), seen.altitude_m)
+        most = max(found)
+        lines.append(("memory", f"{most.size / memory_need.GIB:.1f} GiB a worker, most of all for {most.what}"))
     return lines
 
 

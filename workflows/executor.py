@@ -12,6 +12,7 @@ from dask.callbacks import Callback
 from dask.delayed import Delayed
 from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
 from distributed.comm.core import CommClosedError
+from distributed.system import MEMORY_LIMIT
 
 from ..schemas.cluster import Cluster
 from ..schemas.problems import InvalidInput, Problem
@@ -42,6 +43,8 @@ class Executor(Protocol):
 
     def check(self, job: Job) -> None: ...
 
+    def memory_bytes(self) -> float | None: ...
+
     def compute(self, tasks: Sequence[Delayed], advance: Progress) -> list[Any]: ...
 
 
@@ -53,6 +56,10 @@ class LocalExecutor:
 
     def check(self, job: Job) -> None:
         """This process sees what it sees."""
+
+    def memory_bytes(self) -> float | None:
+        """What a thread may use."""
+        return MEMORY_LIMIT / self._options["num_workers"] if MEMORY_LIMIT else None
 
     def compute(self, tasks: Sequence[Delayed], advance: Progress) -> list[Any]:
         wanted = {task.key for task in tasks}
@@ -87,6 +94,11 @@ class ClusterExecutor:
         problems = [_refused(address, answer) for address, answer in sorted(refusals.items())]
         if problems:
             raise InvalidInput(problems)
+
+    def memory_bytes(self) -> float | None:
+        """What the smallest worker may use; None without a limit."""
+        workers = self.client.scheduler_info(n_workers=-1)["workers"].values()
+        return min((worker["memory_limit"] for worker in workers if worker["memory_limit"]), default=None)
 
     def _wait(self) -> None:
         while not self.client.scheduler_info(n_workers=-1)["workers"]:

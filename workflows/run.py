@@ -33,6 +33,7 @@ from . import (
     maps,
     maps_inputs,
     match,
+    memory_need,
     meshing,
     mosaics,
     plan,
@@ -132,6 +133,9 @@ def run(
 def _until_whole(job: Job, opened: OpenedMission, executor: Executor, asked: Request, out: str) -> RunResult:
     """Go over the steps, again where a stored result turns out to be damaged, which makes it anew."""
     made, lost = plan.plan(opened, job.parameters), set()
+    typical = float(np.median(made.range_m))
+    found = memory_need.needs(opened.calibration.camera, job.parameters, len(made.images), typical)
+    memory_need.refuse_what_cannot_fit(found, executor.memory_bytes())
     while True:
         try:
             return _process(Session(job, opened, made, executor, Ledger(), uuid4().hex[:8]), asked, out)
