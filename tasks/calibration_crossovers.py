@@ -70,26 +70,33 @@ def beside_lines(points: Points, matches: Matches, slopes: Array, slopes_i: Arra
     return Beside(match.astype(np.intp), side.astype(np.intp), point.astype(np.intp), apart)
 
 
-def feet(points: Points, X_local: Array, reference: Array, image: Indices, from_reference: Array) -> Feet:
-    """Altimeter readings that fall next to a laser point, seen from above.
+def feet(X_local: Array, of: Indices | None, reference: Array, image: Indices, from_reference: Array) -> Feet:
+    """Altimeter readings that fall next to something measured, seen from above.
 
     Parameters
     ----------
+    X_local : (P, 3) laser points or matches, metres, NaN where unknown.
+    of : (P, 2) images that see each; a reading takes only what its own image sees. None: whatever image sees it.
     reference : (n, 3) reference points of the images, local, metres.
     image : (S,) image nearest in time to each reading. from_reference : (S, 3) its foot from that image's reference.
     """
-    known = np.flatnonzero(np.isfinite(X_local).all(1))
-    foot = reference[image] + from_reference
-    if not len(known) or not len(foot):
-        none = np.zeros(0, np.intp)
-        return Feet(none, np.zeros((0, 3)), none, np.zeros(0))
-    apart, nearest = KDTree(X_local[known, :2]).query(foot[:, :2], distance_upper_bound=_FOOT_M)
+    foot, known = reference[image] + from_reference, np.isfinite(X_local).all(1)
+    spot, apart = np.zeros(len(foot), np.intp), np.full(len(foot), np.inf)
+    if of is None:
+        groups = [(np.ones(len(foot), bool), known)]
+    else:
+        groups = [(image == k, known & (of == k).any(1)) for k in np.unique(image)]
+    for own, seen in groups:
+        if own.any() and seen.any():
+            apart[own], nearest = KDTree(X_local[seen, :2]).query(foot[own, :2], distance_upper_bound=_FOOT_M)
+            spot[own] = np.append(np.flatnonzero(seen), 0)[nearest]
     near = np.isfinite(apart)
-    return Feet(image[near], from_reference[near], known[np.asarray(nearest)[near]], np.asarray(apart)[near])
+    return Feet(image[near], from_reference[near], spot[near], apart[near])
 
 
-def thinned(matches: Matches, beside: Beside, most: int) -> Indices:
-    """Indices of the matches to keep: of each pair all those beside a line up to twenty, and `most` others."""
+def thinned(matches: Matches, beside: Beside, under: Feet, most: int) -> Indices:
+    """Indices of the matches to keep: those under the altimeter, and of each pair up to twenty of those beside a line
+    and `most` others."""
     near = np.zeros(len(matches.i), bool)
     near[beside.match] = True
     key = matches.i * (int(matches.j.max(initial=0)) + 1) + matches.j
@@ -98,4 +105,4 @@ def thinned(matches: Matches, beside: Beside, most: int) -> Indices:
     for pair in np.unique(key):
         own = np.flatnonzero(key == pair)
         kept += [rng.permutation(own[near[own]])[:_MOST_BESIDE_A_PAIR], rng.permutation(own[~near[own]])[:most]]
-    return np.sort(np.concatenate(kept)) if kept else np.zeros(0, np.intp)
+    return np.unique(np.concatenate([*kept, under.spot])) if kept else np.zeros(0, np.intp)

@@ -104,17 +104,19 @@ class Beside(NamedTuple):
 
 
 class Feet(NamedTuple):
-    """Altimeter readings over a line: image (A,) nearest in time, from_reference (A, 3) the foot from that image's
-    reference point, local axes, metres; point (A,) and distance apart (A,), metres."""
+    """Altimeter readings over something measured: image (A,) nearest in time, from_reference (A, 3) the foot from that
+    image's reference point, local axes, metres; what is there (A,), a laser point or a match of that image, and its
+    distance apart (A,), metres."""
 
     image: Indices
     from_reference: Array
-    point: Indices
+    spot: Indices
     apart: Array
 
 
 class FieldProblem(NamedTuple):
-    """All observations of one round; `sigma` are factors on the stated sigmas of GROUPS."""
+    """All observations of one round; `feet` are on lines, `feet_matched` on matches; `sigma` are factors on the stated
+    sigmas of GROUPS."""
 
     calibration: Calibration
     starts: tuple[SheetBasis, SheetBasis]
@@ -125,6 +127,7 @@ class FieldProblem(NamedTuple):
     crossings: Crossings
     beside: Beside
     feet: Feet
+    feet_matched: Feet
     range_m: float
     sigma: Array
 
@@ -181,7 +184,7 @@ def layout(priors: FieldPriors, track: Track) -> Layout:
 
 
 class Posed(NamedTuple):
-    """R_local_camera (n, 3, 3), C_local (n, 3) and the reference points (n, 3)."""
+    """R_local_camera (n, 3, 3), C_local (n, 3), and the reference points (n, 3) by the navigation's own clock."""
 
     R: Array
     C: Array
@@ -195,9 +198,9 @@ def posed(x: Array, calibration: Calibration, priors: FieldPriors, track: Track)
     bias = Rotation.from_rotvec(shared[_ATTITUDE])
     R_local_vehicle = Rotation.from_matrix(track.R_local_vehicle) * turn * bias * Rotation.from_rotvec(images[:, 3:])
     R = R_local_vehicle.as_matrix()
-    reference = track.X_local + track.velocity * shared[_CLOCK] + images[:, :3]
+    reference = track.X_local + images[:, :3]
     mount = np.array(calibration.mount.rotation) + np.degrees(shared[_MOUNT])
-    C = reference + R @ np.asarray(calibration.mount.translation)
+    C = reference + track.velocity * shared[_CLOCK] + R @ np.asarray(calibration.mount.translation)
     return Posed(R @ R_vehicle_camera(*mount), C, reference)
 
 
@@ -240,23 +243,40 @@ def crossing_heights(p: Crossings, X_local: Array) -> Array:
     return (apart * normal).sum(1)
 
 
-def _match_residuals(p: FieldProblem, cast: _Cast, at: Posed) -> tuple[Array, Array]:
-    """Sampson distances (M,), pixels, and triangulated depths (M, 2) in both cameras."""
-    i, j = p.matches.i, p.matches.j
+def intersect_matches(matches: Matches, slopes_i: Array, slopes_j: Array, at: Posed) -> Array:
+    """Where matches lie (M, 3), local, metres: on the ray of image i, nearest to that of j; NaN without parallax."""
+    i, j = matches.i, matches.j
+    ray_i, turned, t, _ = _two_rays(slopes_i, slopes_j, at, i, j)
+    depth = _depths(ray_i, turned, t)[:, 0]
+    depth = np.where(depth > 0, depth, np.nan)
+    return at.C[i] + np.einsum("mij,mj->mi", at.R[i], depth[:, None] * ray_i)
+
+
+def _two_rays(slopes_i: Array, slopes_j: Array, at: Posed, i: Indices, j: Indices) -> tuple[Array, Array, Array, Array]:
+    """Rays of i and j and the base from i to j (M, 3), all in the frame of camera i, and R (M, 3, 3) from j to i."""
     R = np.einsum("mki,mkj->mij", at.R[i], at.R[j])
     t = np.einsum("mki,mk->mi", at.R[i], at.C[j] - at.C[i])
-    ray_i, ray_j = (np.column_stack([x, np.ones(len(x))]) for x in (cast.slopes_i, cast.slopes_j))
-    turned = np.einsum("mij,mj->mi", R, ray_j)
+    ray_i, ray_j = (np.column_stack([x, np.ones(len(x))]) for x in (slopes_i, slopes_j))
+    return ray_i, np.einsum("mij,mj->mi", R, ray_j), t, R
+
+
+def _depths(ray_i: Array, turned: Array, t: Array) -> Array:
+    """Depths (M, 2) along both rays where these come closest, as `motion.depths`."""
+    a, b, c = (ray_i**2).sum(1), (ray_i * turned).sum(1), (turned**2).sum(1)
+    e, f = (ray_i * t).sum(1), (turned * t).sum(1)
+    determinant = np.maximum(a * c - b * b, 1e-12)
+    return np.column_stack([c * e - b * f, b * e - a * f]) / determinant[:, None]
+
+
+def _match_residuals(p: FieldProblem, cast: _Cast, at: Posed) -> tuple[Array, Array]:
+    """Sampson distances (M,), pixels, and triangulated depths (M, 2) in both cameras."""
+    ray_i, turned, t, R = _two_rays(cast.slopes_i, cast.slopes_j, at, p.matches.i, p.matches.j)
     base = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-9)
     line_i = np.cross(base, turned)
     line_j = np.einsum("mij,mi->mj", R, np.cross(ray_i, base))
     spread = np.sqrt((line_i[:, :2] ** 2).sum(1) + (line_j[:, :2] ** 2).sum(1))
     distance = (ray_i * line_i).sum(1) / np.maximum(spread, 1e-12) * cast.focal_px
-    # where the two rays come closest, as `motion.depths`
-    a, b, c = (ray_i**2).sum(1), (ray_i * turned).sum(1), (turned**2).sum(1)
-    e, f = (ray_i * t).sum(1), (turned * t).sum(1)
-    determinant = np.maximum(a * c - b * b, 1e-12)
-    return distance, np.column_stack([c * e - b * f, b * e - a * f]) / determinant[:, None]
+    return distance, _depths(ray_i, turned, t)
 
 
 def _stated(p: FieldProblem, cast: _Cast, at: Posed, X: Array) -> list[Array]:
@@ -270,7 +290,8 @@ def _stated(p: FieldProblem, cast: _Cast, at: Posed, X: Array) -> list[Array]:
     base = np.linalg.norm(at.C[p.matches.j] - at.C[p.matches.i], axis=1)[p.beside.match]
     depth = p.range_m**2 / (cast.focal_px * np.maximum(base, 0.05)) * 0.5
     beside = np.sqrt(depth**2 + (0.3 * p.range_m * p.beside.apart) ** 2 + 0.003**2)
-    feet = np.sqrt(0.01**2 + (0.3 * p.feet.apart) ** 2)
+    apart = np.concatenate([p.feet.apart, p.feet_matched.apart])
+    feet = np.sqrt(0.01**2 + (0.3 * apart) ** 2)
     t = p.track
     step = np.sqrt(t.drift_m_per_sqrt_s**2 * np.abs(np.diff(t.time_s)) + 2 * _JITTER_M**2)
     track = np.concatenate([np.repeat(step, 2), np.repeat(t.sigma_horizontal[:1], 2)])
@@ -292,17 +313,31 @@ def _misfits(x: Array, p: FieldProblem, cast: _Cast) -> list[Array]:
     shared, images = layout(p.priors, p.track).split(x)
     distance, depth = _match_residuals(p, cast, at)
     beside = depth[p.beside.match, p.beside.side] - X[p.beside.point, 2]
-    foot = at.reference[p.feet.image] + p.feet.from_reference
-    feet = foot[:, 2] + shared[_ALTIMETER] - X_local[p.feet.point, 2]
+    feet = _foot_heights(p.feet, at) + shared[_ALTIMETER] - X_local[p.feet.spot, 2]
+    feet_matched = _foot_heights(p.feet_matched, at) + shared[_ALTIMETER] - _matched_heights(p, cast, at, depth)
     return [
         crossing_heights(p.crossings, X_local),
         np.nan_to_num(beside, nan=1.0),
         distance,
-        feet,
+        np.concatenate([feet, feet_matched]),
         np.concatenate([np.diff(images[:, :2], axis=0).ravel(), images[0, :2]]),
         images[:, 2],
         images[:, 3:].ravel(),
     ]
+
+
+def _foot_heights(feet: Feet, at: Posed) -> Array:
+    """Elevations (A,) where the altimeter has the seabed, local, metres."""
+    return at.reference[feet.image, 2] + feet.from_reference[:, 2]
+
+
+def _matched_heights(p: FieldProblem, cast: _Cast, at: Posed, depth: Array) -> Array:
+    """Elevations (A,) of the matches under the altimeter, as the image over them has them, local, metres."""
+    k, image = p.feet_matched.spot, p.feet_matched.image
+    second = (p.matches.i[k] != image).astype(int)
+    slopes = np.where(second[:, None] == 1, cast.slopes_j[k], cast.slopes_i[k])
+    toward = np.einsum("aj,aj->a", at.R[image, 2], np.column_stack([slopes, np.ones(len(k))]))
+    return at.C[image, 2] + depth[k, second] * toward
 
 
 def _rows(p: FieldProblem) -> Indices:
@@ -315,7 +350,8 @@ def _rows(p: FieldProblem) -> Indices:
         np.column_stack([image[p.crossings.p[:, 0]], image[p.crossings.q[:, 0]]]),
         np.column_stack([m.i[p.beside.match], m.j[p.beside.match]]),
         np.column_stack([m.i, m.j]),
-        np.column_stack([p.feet.image, image[p.feet.point]]),
+        np.column_stack([p.feet.image, image[p.feet.spot]]),
+        np.column_stack([m.i[p.feet_matched.spot], m.j[p.feet_matched.spot]]),
         np.repeat(step, 2, axis=0),
         np.array([[0, -1], [0, -1]]),
         alone,
@@ -331,7 +367,8 @@ def _rows(p: FieldProblem) -> Indices:
 def _group_of(p: FieldProblem) -> Indices:
     """Number of the group of each residual, -1 for priors."""
     n = len(p.track.time_s)
-    sizes = [len(p.crossings.f), len(p.beside.match), len(p.matches.i), len(p.feet.image), 2 * n, n, 3 * n]
+    feet = len(p.feet.image) + len(p.feet_matched.image)
+    sizes = [len(p.crossings.f), len(p.beside.match), len(p.matches.i), feet, 2 * n, n, 3 * n]
     return np.append(np.repeat(np.arange(len(GROUPS)), sizes), np.full(SHARED, -1)).astype(np.intp)
 
 

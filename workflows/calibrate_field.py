@@ -109,42 +109,41 @@ def _problem(
     sheets = field.sheets_of(x, field.field_starts(calibration))
     X = cast_rays(*rays(camera, points.uv), sheets[points.arm])
     X_local = np.einsum("pij,pj->pi", at.R[points.image], X) + at.C[points.image]
-    crossing = crossovers.crossings(points, X_local)
-    slopes = [normalised(camera, uv, made.range_m) for uv in (points.uv, made.matches.uv_i, made.matches.uv_j)]
-    beside = crossovers.beside_lines(points, made.matches, *slopes)
-    kept = crossovers.thinned(made.matches, beside, _MATCHES_A_PAIR)
-    m = made.matches
+    m, (image, foot) = made.matches, made.feet
+    slopes, x_i, x_j = (normalised(camera, uv, made.range_m) for uv in (points.uv, m.uv_i, m.uv_j))
+    beside = crossovers.beside_lines(points, m, slopes, x_i, x_j)
+    X_matched, both = field.intersect_matches(m, x_i, x_j, at), np.column_stack([m.i, m.j])
+    under = crossovers.feet(X_matched, both, at.reference, image, foot)
+    kept = crossovers.thinned(m, beside, under, _MATCHES_A_PAIR)
     matches = field.Matches(m.i[kept], m.j[kept], m.uv_i[kept], m.uv_j[kept])
-    beside = crossovers.beside_lines(points, matches, slopes[0], slopes[1][kept], slopes[2][kept])
-    image, foot = made.feet
-    feet = crossovers.feet(points, X_local, at.reference, image, foot)
     return _only_used(
         field.FieldProblem(
-            calibration,
-            field.field_starts(calibration),
-            priors,
-            made.track,
-            points,
-            matches,
-            crossing,
-            beside,
-            feet,
-            made.range_m,
-            np.ones(len(field.GROUPS)),
+            calibration=calibration,
+            starts=field.field_starts(calibration),
+            priors=priors,
+            track=made.track,
+            points=points,
+            matches=matches,
+            crossings=crossovers.crossings(points, X_local),
+            beside=crossovers.beside_lines(points, matches, slopes, x_i[kept], x_j[kept]),
+            feet=crossovers.feet(X_local, None, at.reference, image, foot),
+            feet_matched=under._replace(spot=np.searchsorted(kept, under.spot)),
+            range_m=made.range_m,
+            sigma=np.ones(len(field.GROUPS)),
         )
     )
 
 
 def _only_used(p: field.FieldProblem) -> field.FieldProblem:
     """Without the laser points that no observation needs: there are ten times as many."""
-    used = np.unique(np.concatenate([p.crossings.p.ravel(), p.crossings.q.ravel(), p.beside.point, p.feet.point]))
+    used = np.unique(np.concatenate([p.crossings.p.ravel(), p.crossings.q.ravel(), p.beside.point, p.feet.spot]))
     number = np.full(len(p.points.uv), -1, np.intp)
     number[used] = np.arange(len(used))
     return p._replace(
         points=field.Points(p.points.uv[used], p.points.image[used], p.points.arm[used], p.points.sigma_px[used]),
         crossings=p.crossings._replace(p=number[p.crossings.p], q=number[p.crossings.q]),
         beside=p.beside._replace(point=number[p.beside.point]),
-        feet=p.feet._replace(point=number[p.feet.point]),
+        feet=p.feet._replace(spot=number[p.feet.spot]),
     )
 
 
@@ -216,7 +215,7 @@ def _field_page(
         ("Crossovers of laser lines", f"{found.counts['crossover']}"),
         ("Their height differences, rms", f"{np.sqrt(np.mean(heights[lit] ** 2)):.2f} mm"),
         ("Matches beside a line, matches in all", f"{found.counts['beside']}, {found.counts['match']}"),
-        ("Altimeter readings over a line", f"{found.counts['altimeter']}"),
+        ("Altimeter readings over a line or a match", f"{found.counts['altimeter']}"),
     )
     said_clock = (
         f"The navigation's clock: {found.clock_s:+.3f} s is to be added to navigation.time_offset in mission.yaml "

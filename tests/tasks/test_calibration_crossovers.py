@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from seamosaic.tasks.calibration_crossovers import beside_lines, crossings, feet, thinned
-from seamosaic.tasks.calibration_field import Matches, Points, crossing_heights
+from seamosaic.tasks.calibration_field import Feet, Matches, Points, crossing_heights
 
 
 def two_lines(apart_m: float):
@@ -32,11 +32,19 @@ def test_gaps_of_a_line_are_not_crossed():
 
 
 def test_altimeter_feet_near_a_line():
-    points, X = two_lines(0.0)
+    _, X = two_lines(0.0)
     image, offset = np.array([0, 0]), np.array([[0.2, 0.01, -2.5], [0.2, 0.5, -2.5]])
-    found = feet(points, X, np.array([[0.0, 0.0, 2.5]]), image, offset)
-    assert len(found.point) == 1
+    found = feet(X, None, np.array([[0.0, 0.0, 2.5]]), image, offset)
+    assert len(found.spot) == 1
     assert found.apart[0] == pytest.approx(0.01, abs=1e-6)
+
+
+def test_altimeter_feet_take_matches_of_their_own_image_only():
+    X = np.array([[0.0, 0.0, -2.0], [0.01, 0.0, -2.0], [np.nan, 0.0, -2.0]])
+    seen_by = np.array([[1, 2], [0, 3], [0, 1]])
+    found = feet(X, seen_by, np.zeros((4, 3)), np.array([0, 2]), np.array([[0.0, 0.0, -2.0], [0.0, 0.2, -2.0]]))
+    assert found.spot.tolist() == [1]
+    assert found.image.tolist() == [0]
 
 
 def test_matches_beside_a_line_are_kept_before_others():
@@ -48,6 +56,9 @@ def test_matches_beside_a_line_are_kept_before_others():
     found = beside_lines(points, matches, slopes, x_i, x_i + 1)
     assert found.match.tolist() == [0]
     assert found.point.tolist() == [0]
-    kept = thinned(matches, found, 10)
+    none = np.zeros(0, np.intp)
+    under = Feet(np.array([0]), np.zeros((1, 3)), np.array([100]), np.zeros(1))
+    kept = thinned(matches, found, Feet(none, np.zeros((0, 3)), none, np.zeros(0)), 10)
     assert len(kept) == 11
+    assert set(thinned(matches, found, under, 10)) == {*kept, 100}
     assert 0 in kept
