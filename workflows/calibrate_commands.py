@@ -110,6 +110,9 @@ def field(
     start: StartOption = None,
     sheet_deg: SheetDegOption = 2.0,
     sheet_mm: SheetMmOption = 40.0,
+    mount_deg: Annotated[
+        float, typer.Option(min=1e-3, max=30, help="1-sigma of the starting mount angles, degrees.")
+    ] = 1.0,
     altimeter_mm: AltimeterOption = 1.0,
     images: Annotated[int, typer.Option(min=6, max=200, help="At most so many images, from the middle.")] = 60,
 ) -> None:
@@ -118,7 +121,7 @@ def field(
     from ..tasks.calibration_field import FieldPriors
     from .calibrate_field import run_field
 
-    priors = FieldPriors(sheet_deg=sheet_deg, sheet_m=1e-3 * sheet_mm, altimeter_m=1e-3 * altimeter_mm)
+    priors = FieldPriors(sheet_deg, 1e-3 * sheet_mm, mount_deg, altimeter_m=1e-3 * altimeter_mm)
     _show(run_field(mission, out, _start(start), priors, Parameters(), images))
 
 
