@@ -71,8 +71,9 @@ class BoardResult(NamedTuple):
     laser_residual_m : (L,) distance of the light on the board from the sheet, along the sheet's normal.
     light_on_board : (L, 3) in the board's frame. laser_used : (L,).
     corner_sigma_px, laser_sigma : measured 1-sigma (pixels; stated sigmas).
-    left_out_m : (n, S) rms distance from the board (by its corners alone) of an image's light, triangulated by an
-        adjustment without it. left_out_sheets : (n, S, 4) its sheets. range_m : (n,) median range of the light.
+    left_out_m : (L,) height over the board (by its corners alone) of the light, triangulated by an adjustment without
+        that of its image; NaN where too little is left to tell. left_out_sheets : (n, S, 4) its sheets.
+    range_m : (n,) median range of the light.
     """
 
     camera: Camera
@@ -375,13 +376,13 @@ def _without(x: Array, p: _Problem, corner: NDArray, laser: NDArray, image: int)
 
 
 def _left_out(x: Array, p: _Problem, corner: NDArray, laser: NDArray) -> tuple[Array, Array, Array]:
-    """Sheets (n, S, 4) without the light of each image, what they are off by on it (n, S), and what is shared (n, K).
+    """Sheets (n, S, 4) without the light of each image, how far they put it off (L,), and what is shared (n, K).
 
-    The second is the rms distance, metres, across the board, of the image's light, triangulated with these sheets,
-    from the board as its corners alone place it. NaN where too little is left to tell.
+    The second is the height, metres, of each laser point, triangulated with these sheets, over the board as its corners
+    alone place it. NaN where too little is left to tell.
     """
     count, lit = len(p.starts), p.data.laser_image
-    sheets, rms = np.full((p.data.images, count, 4), np.nan), np.full((p.data.images, count), np.nan)
+    sheets, off = np.full((p.data.images, count, 4), np.nan), np.full(len(lit), np.nan)
     shared = np.full((p.data.images, _layout(p).shared), np.nan)
     for k in np.unique(lit[laser]):
         state, found = _without(x, p, corner, laser, int(k))
@@ -393,12 +394,12 @@ def _left_out(x: Array, p: _Problem, corner: NDArray, laser: NDArray) -> tuple[A
             here = own & (lit == k)
             if here.any():
                 X = cast_rays(*rays(state.camera, p.data.laser_uv[here]), state.sheets[s])
-                rms[k, s] = float(np.sqrt(np.mean(_above(state, int(k), X) ** 2)))
+                off[here] = _above(state, int(k), X)
         # a sheet that fewer than two other images have is nowhere without this one, and would speak for no scatter
         shared[k] = found
         lost = np.isnan(sheets[k]).any(1)
         shared[k, len(p.names) : len(p.names) + 3 * count][np.repeat(lost, 3)] = np.nan
-    return sheets, rms, shared
+    return sheets, off, shared
 
 
 def _above(state: _State, image: int, X: Array) -> Array:

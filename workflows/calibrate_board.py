@@ -247,9 +247,8 @@ def _page(
     result: Calibration,
 ) -> report.Page:
     data = _data(seen)
-    relative = found.left_out_m / found.range_m[:, None]
-    rms = float(np.sqrt(np.nanmean(found.left_out_m**2)))
-    share = 300 * float(np.sqrt(np.nanmean(relative**2)))
+    relative = found.left_out_m / found.range_m[data.laser_image]
+    rms, share, mean = (_rms(found.left_out_m), 300 * _rms(relative), 300 * float(np.nanmean(np.abs(relative))))
     corner = np.repeat(np.arange(2), len(data.corner_uv))
     residuals = report.residual_map(
         np.tile(data.corner_uv, (2, 1)),
@@ -273,7 +272,10 @@ def _page(
         ("Corners", f"{len(data.corner_uv)}, sigma {found.corner_sigma_px:.3f} px"),
         ("Laser points", f"{int(lit.sum())} on {len(found.sheets)} sheets"),
         ("Ranges", f"{np.nanmin(found.range_m):.3f} to {np.nanmax(found.range_m):.3f} m"),
-        ("Left-out light from the board, rms", f"{1e3 * rms:.3f} mm: {share:.3f} mm per 300 mm of range"),
+        (
+            "Left-out light from the board",
+            f"rms {1e3 * rms:.3f} mm; per 300 mm of range rms {share:.3f} mm, mean distance {mean:.3f} mm",
+        ),
     )
     if setup.bent:
         facts = (*facts, ("Shape of the board", _shape(data, found)))
@@ -283,12 +285,11 @@ def _page(
         report.picture("Residuals of the light", laser, "Distance of the light on the board from its sheet."),
     ]
     said = [*_said(found, rms), *_port(result, found, figures)]
+    of_image = [found.left_out_m[data.laser_image == k] for k in range(len(seen.names))]
     left_out = [
-        report.LeftOut(
-            name, (f"{found.range_m[k]:.3f} m", f"{1e3 * np.sqrt(np.nanmean(found.left_out_m[k] ** 2)):.3f} mm")
-        )
-        for k, name in enumerate(seen.names)
-        if np.isfinite(found.left_out_m[k]).any()
+        report.LeftOut(name, (f"{found.range_m[k]:.3f} m", f"{1e3 * _rms(own):.3f} mm"))
+        for k, (name, own) in enumerate(zip(seen.names, of_image, strict=True))
+        if np.isfinite(own).any()
     ]
     return report.Page(
         title="Calibration with a board",
@@ -325,6 +326,10 @@ def _port(result: Calibration, found: adjusting.BoardResult, figures: list[repor
     said, more = calibrate.port_parts(result, shown)
     figures += more
     return [calibrate.accuracy_statement(result, sheets, shown), *said]
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
 
 
 def _said(found: adjusting.BoardResult, rms: float) -> list[str]:

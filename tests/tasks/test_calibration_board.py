@@ -69,9 +69,10 @@ def test_left_out_images_tell_a_wrong_light():
     good = board.calibrate_board(data, true.camera, ())
     off = data.laser_uv + np.where(data.laser_image[:, None] == 4, [12.0, 0.0], 0.0)
     bad = board.calibrate_board(data._replace(laser_uv=off), true.camera, ())
-    before, after = (
-        np.nanmean(found.left_out_m[4]) if np.isfinite(found.left_out_m[4]).any() else np.inf for found in (good, bad)
-    )
+    fourth = data.laser_image == 4
+    assert np.isfinite(good.left_out_m[fourth]).all()
+    before, after = (np.nan_to_num(found.left_out_m[fourth], nan=np.inf) for found in (good, bad))
+    before, after = np.sqrt(np.mean(before**2)), np.sqrt(np.mean(after**2))
     assert after > 3 * before
 
 

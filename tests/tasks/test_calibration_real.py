@@ -60,6 +60,8 @@ def test_etna():
     rms = [np.sqrt(np.nanmean(found.left_out_m**2)) for found in (flat, bent)]
     assert 0.00005 < rms[1] < 0.00026
     assert rms[1] < 0.4 * rms[0]
+    distance_mm = 300 * np.abs(bent.left_out_m) / bent.range_m[data.laser_image]  # at 300 mm of range
+    assert 0.05 < distance_mm.mean() < 0.25
     assert bent.corner_sigma_px < 0.055
     turned_by = sorted(angle_deg(sheet[:3], bent.sheets[0][:3]) for sheet in bent.left_out_sheets[:, 0])
     # one frame turns the plane by 0.17 degrees, now that its light has no say in the corners' places either
