@@ -15,7 +15,18 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from ..schemas.parameters import AdjustParameters
-from .factors import datum, first_values, gaussian, navigation_factors, optimise, pose, read_poses, robust
+from . import tree_covariances
+from .factors import (
+    datum,
+    elimination_order,
+    first_values,
+    gaussian,
+    navigation_factors,
+    optimise,
+    pose,
+    read_poses,
+    robust,
+)
 from .motion import Motion
 from .navigation import NavigationPrior, Poses, relative, with_half_turns
 from .residuals import Residuals
@@ -226,14 +237,16 @@ def _covariances(graph: Any, values: Any, poses: Poses) -> Array:
     That a map may move as a whole by decimetres, but its parts by tenths of millimetres, can be too much for Cholesky
     factors; QR bears it, for several times the memory.
     """
+    count, linear = len(poses.C_local), graph.linearize(values)
+    order = elimination_order(linear)
     try:
-        marginals = gtsam.Marginals(graph, values)
+        return tree_covariances.covariances(linear.eliminateMultifrontal(order), count, order.at(order.size() - 1)).own
     except RuntimeError:
         p = gtsam.ISAM2Params()
         p.setFactorization("QR")
         marginals = gtsam.ISAM2(p)
         marginals.update(graph, values)
-    found = np.full((len(poses.C_local), 6, 6), np.nan)
+    found = np.full((count, 6, 6), np.nan)
     for k in np.flatnonzero(poses.known).tolist():
         found[k] = marginals.marginalCovariance(k)
     return found

@@ -49,6 +49,11 @@ def optimise(graph: Any, values: Any) -> Any:
     return gtsam.LevenbergMarquardtOptimizer(graph, values, p).optimize()
 
 
+def elimination_order(graph: Any) -> Any:
+    """Of a linear graph, by nested dissection, which a survey's wide and flat net of images asks for."""
+    return gtsam.Ordering.MetisGaussianFactorGraph(graph)
+
+
 def read_poses(values: Any, start: Poses) -> Poses:
     """The cameras' poses in values; NaN where they had none to start from."""
     R, C = np.full_like(start.R_local_camera, np.nan), np.full_like(start.C_local, np.nan)

@@ -68,6 +68,11 @@ def mosaic_cell_m(ground_sample_m: float) -> float:
     return _rounded_up(max(0.002, ground_sample_m))
 
 
+def max_interpolation_m(range_m: float) -> float:
+    """How far the bathymetry is interpolated of itself: the larger of 1 m and a third of the range (FORMATS)."""
+    return max(1.0, range_m / 3)
+
+
 def _rounded_up(cell_m: float) -> float:
     return round(math.ceil(round(cell_m / _STEP_M, 6)) * _STEP_M, 4)
 

@@ -12,7 +12,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .factors import read_poses
+from . import tree_covariances
+from .factors import elimination_order, read_poses
 from .laser_ranges import Ranges
 from .navigation import Poses
 from .tracks import Sights
@@ -273,7 +274,7 @@ def solve(fixed: Any, start: State, o: Observations, tolerance: float, afloat: b
             made = reduced(o, blocks, damping)
             made.graph.push_back(held)
             made.graph.add(_anchor(state.poses, _ANCHOR if afloat else 0.0))
-            ordering = ordering or _elimination_order(made.graph)
+            ordering = ordering or elimination_order(made.graph)
             with suppress(RuntimeError):  # too weakly held for Cholesky's way: damping helps
                 trial = _stepped(o, state, made, made.graph.optimize(ordering))
                 after = fixed.error(trial.values) + error(o, trial.poses, trial.X)
@@ -284,21 +285,16 @@ def solve(fixed: Any, start: State, o: Observations, tolerance: float, afloat: b
     return state
 
 
-def _elimination_order(graph: Any) -> Any:
-    """By nested dissection, which a survey's wide and flat net of images asks for."""
-    return gtsam.Ordering.MetisGaussianFactorGraph(graph)
-
-
 def _middle(poses: Poses) -> int:
     """The camera in the middle of those that have a pose."""
     known = np.flatnonzero(poses.known)
     return int(known[len(known) // 2])
 
 
-def _anchor(poses: Poses, information: float, right: Array | None = None) -> Any:
-    """A factor that holds one camera where it is, or pushes it by `right` (6,)."""
+def _anchor(poses: Poses, information: float) -> Any:
+    """A factor that holds one camera where it is."""
     weight = np.diag([0.0, 0.0, 0.0, *[information] * 3])
-    return gtsam.HessianFactor(_middle(poses), weight, np.zeros(6) if right is None else right, 0.0)
+    return gtsam.HessianFactor(_middle(poses), weight, np.zeros(6), 0.0)
 
 
 def covariances(fixed: Any, state: State, o: Observations) -> Array:
@@ -315,24 +311,16 @@ def covariances(fixed: Any, state: State, o: Observations) -> Array:
     """
     graph = reduced(o, linearised(o, state.poses, state.X), 0.0).graph
     graph.push_back(fixed.linearize(state.values))
-    order = _elimination_order(graph)
+    middle = _middle(state.poses)
+    order = elimination_order(graph)
+    keys = [order.at(k) for k in range(order.size())]
     graph.add(_anchor(state.poses, _ANCHOR))
-    tree = graph.eliminateMultifrontal(order)
-    middle = tree.optimize()
-    known = [k for k in np.flatnonzero(state.poses.known).tolist() if middle.exists(k)]
-    found = np.full((len(state.poses.C_local), 6, 6), np.nan)
-    found[known] = [tree.marginalCovariance(k) for k in known]
-    across = np.zeros((len(found), 6, 3))  # covariance of each pose with the place of the anchor
-    for axis in range(3):
-        pushed = gtsam.GaussianFactorGraph()
-        pushed.push_back(graph)
-        pushed.add(_anchor(state.poses, 0.0, np.eye(6)[3 + axis]))
-        delta = pushed.optimize(order)
-        across[known, :, axis] = [delta.at(k) - middle.at(k) for k in known]
-    of_anchor = across[_middle(state.poses), 3:]
-    left = np.eye(3) / _ANCHOR - (of_anchor + of_anchor.T) / 2
+    tree = graph.eliminateMultifrontal(gtsam.Ordering([*(key for key in keys if key != middle), middle]))
+    found, with_anchor = tree_covariances.covariances(tree, len(state.poses.C_local), middle)
+    left = np.eye(3) / _ANCHOR - found[middle, 3:, 3:]
     if np.linalg.eigvalsh(left)[0] < _NOTHING_LEFT / _ANCHOR:
         raise RuntimeError("nothing but the anchor holds the map")
+    across = with_anchor[:, :, 3:]
     return found + across @ np.linalg.inv(left) @ across.transpose(0, 2, 1)
 
 

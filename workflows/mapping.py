@@ -8,7 +8,7 @@ from dask.delayed import Delayed, delayed
 from ..tasks import camera as cameras
 from ..tasks import grids, pairs
 from ..tasks.grids import Grid
-from . import dense, layers, maps, memory_need, meshing, mosaics
+from . import dense, layers, maps, meshing, mosaics
 from .job import Done
 from .maps_inputs import Image, MapJob, Pair, Tile
 from .plan import batches
@@ -40,7 +40,8 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     gsd = cameras.ground_sample_distance(job.calibration.camera, typical)
     cell = grids.bathymetry_cell_m(gsd) if p.grid.cell_m == "auto" else float(p.grid.cell_m)
     mosaic_cell = grids.mosaic_cell_m(gsd) if p.mosaic.cell_m == "auto" else float(p.mosaic.cell_m)
-    reach = memory_need.interpolated_m(p, typical)
+    across = p.grid.max_interpolation_m
+    reach = grids.max_interpolation_m(typical) if across == "auto" else float(across)
     worst = typical * _WORST_SIGMA if p.grid.max_sigma_m == "auto" else float(p.grid.max_sigma_m)
     enough = _LEAST_SEEN if p.grid.max_sigma_m == "auto" else 1.0
     m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst, enough)

@@ -30,12 +30,6 @@ class Need(NamedTuple):
     parameter: str = ""
 
 
-def interpolated_m(parameters: Parameters, range_m: float) -> float:
-    """How far the bathymetry is interpolated, metres, where cameras are at a height above the seabed."""
-    chosen = parameters.grid.max_interpolation_m
-    return max(1.0, range_m / 3) if chosen == "auto" else float(chosen)
-
-
 def needs(camera: Camera, parameters: Parameters, images: int, range_m: float) -> list[Need]:
     """What the largest tasks need.
 
@@ -46,7 +40,9 @@ def needs(camera: Camera, parameters: Parameters, images: int, range_m: float) -
     pixels = camera.width * camera.height
     usual = grids.bathymetry_cell_m(ground_sample_distance(camera, range_m))
     cell = usual if parameters.grid.cell_m == "auto" else min(usual, float(parameters.grid.cell_m))
-    side = parameters.grid.tile_cells + 2 * halo_cells(interpolated_m(parameters, range_m), cell)
+    across = parameters.grid.max_interpolation_m
+    reach = grids.max_interpolation_m(range_m) if across == "auto" else float(across)
+    side = parameters.grid.tile_cells + 2 * halo_cells(reach, cell)
     texels = parameters.mosaic.tile_cells
     image = _PROCESS + _EACH_PIXEL * pixels
     return [

@@ -76,7 +76,7 @@ def kills(rng: random.Random) -> Iterator[list[int]]:
     ended = threading.Event()
 
     def kill() -> None:
-        while not ended.wait(rng.uniform(0.0, 4.0)):
+        while not ended.wait(rng.uniform(0.0, 15.0)):  # a worker takes seconds to start: some must live to do something
             found = [child for child in psutil.Process().children() if is_at_work(child)]
             if found:
                 victim = rng.choice(found)

@@ -16,7 +16,7 @@ NEUTRAL = {
     *(f"catalog.{name}" for name in ("filesystems", "publishing", "runs")),
     *("schemas.cluster", "workflows.clusters", "workflows.footing"),
     *(f"schemas.{name}" for name in ("base", "expectation", "parameters", "problems", "products", "provenance")),
-    *(f"workflows.{name}" for name in ("executor", "job", "progress", "request", "session")),
+    *(f"workflows.{name}" for name in ("executor", "job", "memory_need", "progress", "request", "session")),
 }
 LOADED = "import sys, seamosaic.workflows.run; print(*(name for name in sys.modules if name.startswith('seamosaic.')))"
 
