@@ -46,6 +46,7 @@ def first_values(graph: Any, start: Poses) -> Any:
 def optimise(graph: Any, values: Any) -> Any:
     """The values at which a graph's error is least (Levenberg & Marquardt)."""
     p = gtsam.LevenbergMarquardtParams()
+    p.setOrderingType("METIS")
     return gtsam.LevenbergMarquardtOptimizer(graph, values, p).optimize()
 
 

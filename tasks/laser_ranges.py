@@ -79,20 +79,20 @@ def measure(poses: Poses, X: Array, soundings: Mapping[int, Array], most: int) -
         tree, slope, width = KDTree(X[:, :2]), slopes(X), _neighbours(X)[0]
         for k, own in soundings.items():
             if len(own) and np.isfinite(poses.C_local[k]).all():
-                known = width < _WIDEST * _REACH * float(np.median(own[:, 2]))
-                track, range_m, away_m = _of_image(poses, k, own, X, slope, tree, most, known)
+                track, range_m, away_m = _of_image(poses, k, own, X, slope, tree, most, width)
                 found.append((np.full(len(track), k, np.intp), track, range_m, away_m, slope[track]))
     return Ranges(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
-def _of_image(poses: Poses, k: int, own: Array, X: Array, slope: Array, tree: KDTree, most: int, known: Array):
+def _of_image(poses: Poses, k: int, own: Array, X: Array, slope: Array, tree: KDTree, most: int, width: Array):
     """Tie points (K,) of known slope near the laser of image k, their ranges and how far each is from a sounding."""
     R, C = poses.R_local_camera[k], poses.C_local[k]
     ground = own @ R.T + C
     centre = ground[:, :2].mean(0)
-    radius = np.linalg.norm(ground[:, :2] - centre, axis=1).max() + _REACH * float(np.median(own[:, 2]))
+    reach = _REACH * float(np.median(own[:, 2]))
+    radius = np.linalg.norm(ground[:, :2] - centre, axis=1).max() + reach
     near = np.array(sorted(tree.query_ball_point(centre, radius)), np.intp)
-    near = near[known[near]]
+    near = near[width[near] < _WIDEST * reach]
     seen = (X[near] - C) @ R
     near, seen = near[seen[:, 2] > 0], seen[seen[:, 2] > 0]
     lit, count = KDTree(own[:, :2] / own[:, 2:]), min(_NEAREST, len(own))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrtri
 
 Array = NDArray[Any]
 Indices = NDArray[np.intp]
@@ -39,12 +39,13 @@ def covariances(tree: Any, count: int, last: int) -> Covariances:
         size = len(R) // _POSE
         own = keys[:size]
         rows = _rows(above, keys[size:])
-        G = solve_triangular(R, np.concatenate([np.eye(len(R)), conditional.S()], axis=1))
-        joint = _joint(G[:, : len(R)], G[:, len(R) :], joint[np.ix_(rows, rows)])
+        R_inverse = dtrtri(R)[0]
+        G = R_inverse @ conditional.S()
+        joint = _joint(R_inverse, G, joint[np.ix_(rows, rows)])
         if last in own:
             across = joint[:, _rows(keys, np.array([last]))]
         else:
-            across = np.concatenate([-G[:, len(R) :] @ across[rows], across[rows]])
+            across = np.concatenate([-G @ across[rows], across[rows]])
         at = np.flatnonzero(own < count)
         found.own[own[at]] = joint[: len(R), : len(R)].reshape(size, _POSE, size, _POSE)[at, :, at]
         found.with_last[own[at]] = across[: len(R)].reshape(size, _POSE, _POSE)[at]
