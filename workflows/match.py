@@ -32,6 +32,7 @@ class PairTask(NamedTuple):
     poses : of these two images. range_m : height above the seabed where the laser does not tell.
     margin_m : how far the relative position may be wrong. lit_i, lit_j : laser images that sound for either.
     next : whether j was taken right after i, so that they overlap whatever navigation says.
+    free : whether the adjustment contradicts navigation here: poses and prior are the adjustment's.
     """
 
     i: int
@@ -43,6 +44,7 @@ class PairTask(NamedTuple):
     lit_i: tuple[Lit, ...] = ()
     lit_j: tuple[Lit, ...] = ()
     next: bool = False
+    free: bool = False
 
     @property
     def rows(self) -> tuple[int, ...]:
@@ -96,6 +98,7 @@ def _match(job: Job, pair: PairTask, keys: Sequence[str], loaded: Mapping[int, E
         round(pair.margin_m, 6),
         len(pair.lit_i),
         pair.next,
+        pair.free,
     ]
 
     def make() -> Made:
@@ -144,7 +147,7 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
             "matches": count,
             "inliers": len(agreed),
             "turned": list(turned),
-            "free": free,
+            "free": free or pair.free,
         },
     )
 

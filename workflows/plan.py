@@ -11,7 +11,7 @@ from ..catalog.missions import OpenedMission
 from ..schemas.parameters import Parameters
 from ..tasks import navigation, pairs, rotations
 from ..tasks.frames import MapFrame
-from ..tasks.navigation import NavigationPrior, Poses
+from ..tasks.navigation import NavigationPrior, Poses, RelativePrior
 from .extract import ImageTask
 from .match import Lit, PairTask
 
@@ -19,6 +19,7 @@ from .match import Lit, PairTask
 ASSUMED_RANGE_M = 3.0
 _SEQUENTIAL_REACH = 3
 _BRIDGE_REACH = 16
+_NEAR_SHARE = 0.05  # of the range: so far off is every relative position held possible
 # A laser image taken within this of a texture image sounds for it, seconds
 _LIT_WITHIN_S = 10.0
 
@@ -120,7 +121,7 @@ def first_pairs(made: Plan, opened: OpenedMission, parameters: Parameters) -> li
     tasks = []
     for i, j in found:
         prior = navigation.relative(made.prior, i, j)
-        spread = 2 * float(np.sqrt(prior.covariance[3:, 3:].trace())) + 0.05 * made.range_m[i]
+        spread = _spread_m(prior, float(made.range_m[i]))
         poses = _two(made.prior.poses, i, j)
         beside = lit.get(i, ()), lit.get(j, ())
         tasks.append(PairTask(i, j, poses, prior, float(made.range_m[i]), spread, *beside, (i, j) in following))
@@ -146,7 +147,7 @@ def _soon(time_s: np.ndarray, a: int, b: int) -> bool:
     return abs(float(time_s[a] - time_s[b])) <= _LIT_WITHIN_S
 
 
-def more_pairs(
+def chained_pairs(
     made: Plan,
     opened: OpenedMission,
     parameters: Parameters,
@@ -167,6 +168,40 @@ def more_pairs(
     found += [(int(rows[a]), int(rows[b])) for a, b in bridges]
     tried = set(known)
     return [PairTask(i, j, None, None, float(range_m[i]), 0.0) for i, j in found if (i, j) not in tried]
+
+
+def misplaced_pairs(
+    made: Plan,
+    opened: OpenedMission,
+    parameters: Parameters,
+    poses: Poses,
+    range_m: np.ndarray,
+    known: Sequence[tuple[int, int]],
+) -> list[PairTask]:
+    """With navigation: pairs not linked that overlap by the adjusted poses, but for navigation were farther apart.
+
+    Where navigation jumped or drifted more than it says, its pairs are the wrong ones.
+    """
+    assert made.prior is not None
+    rows = np.array([image.row for image in made.images if image.role != "laser"], int)
+    outlines = pairs.footprints(opened.calibration.camera, poses, range_m)
+    corrected, lit, linked = made.prior._replace(poses=poses), _lit(made), set(known)
+    moved = poses.C_local - made.prior.poses.C_local
+    tasks = []
+    for i, j in overlapping(outlines, rows, _margin(made.prior), parameters):
+        if (i, j) in linked or not np.linalg.norm(moved[j] - moved[i]) > _NEAR_SHARE * range_m[i]:
+            continue
+        prior = navigation.relative(corrected, i, j)
+        spread = _spread_m(prior, float(range_m[i]))
+        if np.linalg.norm(moved[j] - moved[i]) > spread:
+            beside = lit.get(i, ()), lit.get(j, ())
+            tasks.append(PairTask(i, j, _two(poses, i, j), prior, float(range_m[i]), spread, *beside, free=True))
+    return tasks
+
+
+def _spread_m(prior: RelativePrior, range_m: float) -> float:
+    """How far a relative position may be wrong, metres."""
+    return 2 * float(np.sqrt(prior.covariance[3:, 3:].trace())) + _NEAR_SHARE * range_m
 
 
 def overlapping(

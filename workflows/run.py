@@ -207,7 +207,7 @@ CODE = {
 
 
 def poses(state: Session) -> Posed:
-    """One graph over batches of images, then pairs, then the adjustment; without navigation, loops after it."""
+    """One graph over batches of images, then pairs, then the adjustment; then what that shows to overlap besides."""
     job, made = state.job, state.plan
     for step in (extract.STEP, match.STEP, solve.STEP):
         state.ledger.begin(step)
@@ -226,8 +226,7 @@ def poses(state: Session) -> Posed:
             log.warning("mission=%s step=%s image=%s %s", job.mission_id, extract.STEP, image.path, status)
     matched = [pair for part in parts[len(extracts) :] for pair in part]
     adjustments = [adjusted]
-    if made.prior is None:
-        matched = _close_loops(state, parts[: len(extracts)], matched, adjustments, batch_of)
+    matched = _close_loops(state, parts[: len(extracts)], matched, adjustments, batch_of)
     state.ledger.end(extract.STEP, list(extracted.values()))
     state.ledger.end(match.STEP, [done for _, _, done in matched])
     state.ledger.end(solve.STEP, adjustments)
@@ -241,21 +240,26 @@ def _close_loops(
     adjustments: list[Done],
     batch_of: dict[int, int],
 ) -> list[tuple[int, int, Done]]:
-    """Without navigation: match what overlaps by the poses so far and adjust again, until nothing new overlaps.
+    """Match what overlaps by the poses so far and adjust again, until nothing new overlaps.
 
-    All matches; the adjustments are added to those given.
+    With navigation that is nothing, unless the poses contradict it. All matches; the adjustments are added to those
+    given.
     """
     job, made = state.job, state.plan
     extracted = _by_row(made, extracts)
     ranges = np.array([mapping.range_of(extracted.get(k), r) for k, r in enumerate(made.range_m)])
+    more = plan.chained_pairs if made.prior is None else plan.misplaced_pairs
+    known = [(i, j) for i, j, done in matched if made.prior is None or done.info["model"]]
     for turn in range(_LOOP_ROUNDS):
-        known = [(i, j) for i, j, _ in matched]
         poses = _solution(job, adjustments[-1]).poses
-        wanted = plan.more_pairs(made, state.opened, job.parameters, poses, ranges, known)
+        wanted = more(made, state.opened, job.parameters, poses, ranges, known)
         if not wanted:
             break
         tasks = _match_tasks(state, wanted, extracts, batch_of, f"match-{turn}")
-        matched = matched + [pair for part in compute(state, "loops", tasks) for pair in part]
+        again = [pair for part in compute(state, "loops", tasks) for pair in part]
+        tried = {(i, j) for i, j, _ in again}
+        known += tried
+        matched = [pair for pair in matched if pair[:2] not in tried] + again
         adjustments += compute(state, "adjust", [_adjust_task(state, [matched], extracts, f"adjust-{turn}")])
     return matched
 
