@@ -26,7 +26,7 @@ from ..tasks.calibration_lines import Lines, cross_on_flat, no_lines
 from ..tasks.rotations import R_vehicle_camera
 from . import match, plan
 from .extract import ImageTask
-from .job import Job, log
+from .job import Job, Made, log
 from .progress import progress
 
 Result = TypeVar("Result")
@@ -296,7 +296,11 @@ def matches(survey: Survey, parameters: Parameters) -> Matches:
     needed = [image for image in of_survey.images if image.row in paired]
     seen = _each(survey, "features", lambda image: _entry(survey, image, parameters), needed)
     entries = {image.row: entry for image, entry in zip(needed, seen, strict=True)}
-    found = _each(survey, "matches", lambda task: match.between(job, task, entries[task.i], entries[task.j]), tasks)
+
+    def one(wanted: match.Wanted) -> Made:
+        return match.between(job, match.believed(wanted, made.prior), entries[wanted.i], entries[wanted.j])
+
+    found = _each(survey, "matches", one, tasks)
     linked = [(task, made_) for task, made_ in zip(tasks, found, strict=True) if made_.info["model"]]
     if not linked:
         none = np.zeros(0, np.intp)

@@ -40,7 +40,7 @@ _Views = Callable[[Image], tuple[np.ndarray, np.ndarray]]
 def dense_batch(m: MapJob, batch: Sequence[DensePair]) -> list[Done]:
     """Match some pairs densely."""
     cv2.setNumThreads(1)
-    solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
+    solution = solve.solution(m.job, m.adjusted)
     view = lru_cache(_IMAGES_KEPT)(lambda image: _view(m, image))
 
     def one(pair: DensePair) -> Done:
@@ -126,7 +126,7 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
 
     pairs : each with the key of its dense matching, "" without, and the images that touch it.
     """
-    solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
+    solution = solve.solution(m.job, m.adjusted)
 
     def make() -> Made:
         dense_off, tie_off = [dense_cells.NO_DIFFERENCES], [dense_cells.NO_DIFFERENCES]

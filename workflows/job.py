@@ -133,10 +133,15 @@ def load(job: Job, step: str, key: str, names: Collection[str] | None = None) ->
     LostEntry
         If it is gone or damaged; then it is forgotten, so that going over the steps again makes it anew.
     """
-    entry = job.store.get(step, key, names)
+    return read(job.store, step, key, names)
+
+
+def read(store: Store, step: str, key: str, names: Collection[str] | None = None) -> Entry:
+    """`load` for what is remembered by store and key."""
+    entry = store.get(step, key, names)
     if entry is None:
-        job.store.remove(step, key)
-        raise LostEntry(f"{job.store.path(step, key)} is gone or damaged and has to be made anew")
+        store.remove(step, key)
+        raise LostEntry(f"{store.path(step, key)} is gone or damaged and has to be made anew")
     return entry
 
 

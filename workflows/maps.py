@@ -27,7 +27,7 @@ _TRUST = 2 / 3  # in what laser and matching say of each other, against what the
 
 def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
     """Soundings, tie points and dense matching of a tile, gridded. agreed : by `dense.agreement`."""
-    solution = relative(solve.solution(load(m.job, solve.STEP, m.adjusted)), agreed.info["laser_m"])
+    solution = relative(solve.solution(m.job, m.adjusted), agreed.info["laser_m"])
     # what was found and not from what: another image elsewhere is no reason to make this tile anew
     said = [agreed.info[name] for name in ("dense_px", "tie_px")] + [round(_bend_m(solution, agreed), 4)]
     inputs = [f"{image.row}:{image.key}" for image in tile.images] + [pose_digest(solution, rows_of(tile))]

@@ -1,7 +1,7 @@
 """Per pair: matches and the metric motion between two images (paper III.E)."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -10,13 +10,16 @@ import numpy as np
 from ..catalog.store import Entry
 from ..tasks import camera, features, guided, motion, pairs
 from ..tasks.adjust import Link
-from ..tasks.navigation import Poses, RelativePrior, with_half_turn
+from ..tasks.navigation import NavigationPrior, Poses, RelativePrior, relative, with_half_turn
 from ..tasks.rotations import angle_between_deg
 from . import extract
 from .job import Done, Job, Made, array_digest, code_version, load, once, stage
 
 STEP = "match"
 VERSION = code_version(sys.modules[__name__])
+
+
+NEAR_SHARE = 0.05  # of the range: so far off is every relative position held possible
 
 
 class Lit(NamedTuple):
@@ -26,84 +29,126 @@ class Lit(NamedTuple):
     step: RelativePrior
 
 
-class PairTask(NamedTuple):
-    """Two images to match, i < j, rows of the frames table; their poses so far, if any.
+class Wanted(NamedTuple):
+    """Two images to match, i < j, rows of the frames table.
 
-    poses : of these two images. range_m : height above the seabed where the laser does not tell.
-    margin_m : how far the relative position may be wrong. lit_i, lit_j : laser images that sound for either.
-    next : whether j was taken right after i, so that they overlap whatever navigation says.
-    free : whether the adjustment contradicts navigation here: poses and prior are the adjustment's.
+    range_m : height above the seabed where the laser does not tell. lit_i, lit_j : rows of laser images that sound for
+    either. next : whether j was taken right after i, so that they overlap whatever navigation says.
+    free : whether the adjustment contradicts navigation here, and stands for it.
     """
 
     i: int
     j: int
-    poses: Poses | None
-    prior: RelativePrior | None
     range_m: float
-    margin_m: float
-    lit_i: tuple[Lit, ...] = ()
-    lit_j: tuple[Lit, ...] = ()
+    lit_i: tuple[int, ...] = ()
+    lit_j: tuple[int, ...] = ()
     next: bool = False
     free: bool = False
 
     @property
     def rows(self) -> tuple[int, ...]:
         """Every image whose extraction the pair needs."""
-        return (self.i, self.j, *(lit.row for lit in (*self.lit_i, *self.lit_j)))
+        return (self.i, self.j, *self.lit_i, *self.lit_j)
+
+
+class PairTask(NamedTuple):
+    """Two images to match, with what navigation, or what stands for it, believes of them.
+
+    poses : of these two images. prior : of their motion. margin_m : how far their relative position may be wrong.
+    lit_i, lit_j : laser images that sound for either.
+    """
+
+    wanted: Wanted
+    poses: Poses | None
+    prior: RelativePrior | None
+    margin_m: float
+    lit_i: tuple[Lit, ...] = ()
+    lit_j: tuple[Lit, ...] = ()
+
+
+def believed(wanted: Wanted, prior: NavigationPrior | None) -> PairTask:
+    """What navigation believes of a pair; without navigation nothing."""
+    if prior is None:
+        return PairTask(wanted, None, None, 0.0)
+    step = relative(prior, wanted.i, wanted.j)
+    both = [wanted.i, wanted.j]
+    poses = Poses(prior.poses.R_local_camera[both], prior.poses.C_local[both])
+    lit_i, lit_j = (
+        tuple(Lit(row, relative(prior, k, row)) for row in rows)
+        for k, rows in zip(both, (wanted.lit_i, wanted.lit_j), strict=True)
+    )
+    return PairTask(wanted, poses, step, margin_m(step, wanted.range_m), lit_i, lit_j)
+
+
+def margin_m(step: RelativePrior, range_m: float) -> float:
+    """How far the relative position of two images may be wrong, metres."""
+    return 2 * float(np.sqrt(step.covariance[3:, 3:].trace())) + NEAR_SHARE * range_m
 
 
 Carried = tuple[tuple[Entry, RelativePrior], ...]
 PairSoundings = tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]
 _HALF_TURNS = (True, True), (False, True), (True, False)
+_READ = "feature_uv", "feature_descriptors", "laser_X"  # of an extraction
 _ALIKE_DEG = 20.0
 _ALIKE_COSINE = 0.7
 # strongest features that are asked whether navigation is wrong, of images taken one after the other and of others
 _OF_NEXT, _OF_OTHERS = 1500, 700
 
 
-def match_batch(job: Job, batch: Sequence[PairTask], extracted: Mapping[int, Done]) -> list[tuple[int, int, Done]]:
-    """Match some pairs; `extracted` maps rows to their extraction."""
+def match_batch(
+    job: Job, batch: Sequence[Wanted], extracted: Mapping[int, Done], prior: NavigationPrior | None
+) -> list[tuple[int, int, Done]]:
+    """Match some pairs.
+
+    extracted : maps rows to their extraction. prior : navigation, or the poses that stand for it.
+    """
     cv2.setNumThreads(1)
     loaded: dict[int, Entry] = {}
+
+    def entry(row: int) -> Entry:
+        if row not in loaded:
+            loaded[row] = load(job, extract.STEP, extracted[row].key, _READ)
+        return loaded[row]
+
     found = []
-    for pair in batch:
-        if any(extracted[row].info["status"] for row in (pair.i, pair.j)):
-            found.append((pair.i, pair.j, Done(STEP, "", False, 0.0, {"model": "", "matches": 0, "inliers": 0})))
-            continue
-        pair = _readable(pair, extracted)
-        for row in pair.rows:
-            if row not in loaded:
-                loaded[row] = load(job, extract.STEP, extracted[row].key)
-        keys = [extracted[row].key for row in pair.rows]
-        found.append((pair.i, pair.j, _match(job, pair, keys, loaded)))
-        loaded = {row: entry for row, entry in loaded.items() if row >= min(pair.rows)}
+    for wanted in batch:
+        if any(extracted[row].info["status"] for row in (wanted.i, wanted.j)):
+            done = Done(STEP, "", False, 0.0, {"model": "", "matches": 0, "inliers": 0})
+        else:
+            wanted = _readable(wanted, extracted)
+            keys = [extracted[row].key for row in wanted.rows]
+            done = _match(job, believed(wanted, prior), keys, entry)
+        found.append((wanted.i, wanted.j, done))
+        for row in [row for row in loaded if row < min(wanted.rows)]:
+            del loaded[row]
     return found
 
 
-def _readable(pair: PairTask, extracted: Mapping[int, Done]) -> PairTask:
+def _readable(wanted: Wanted, extracted: Mapping[int, Done]) -> Wanted:
     """The pair without laser images that could not be read."""
     lit_i, lit_j = (
-        tuple(lit for lit in side if lit.row in extracted and not extracted[lit.row].info["status"])
-        for side in (pair.lit_i, pair.lit_j)
+        tuple(row for row in side if row in extracted and not extracted[row].info["status"])
+        for side in (wanted.lit_i, wanted.lit_j)
     )
-    return pair._replace(lit_i=lit_i, lit_j=lit_j)
+    return wanted._replace(lit_i=lit_i, lit_j=lit_j)
 
 
-def _match(job: Job, pair: PairTask, keys: Sequence[str], loaded: Mapping[int, Entry]) -> Done:
+def _match(job: Job, pair: PairTask, keys: Sequence[str], entry: Callable[[int], Entry]) -> Done:
     known = [] if pair.poses is None else [array_digest(*pair.poses)]
     known += [array_digest(*step) for step in (pair.prior, *(lit.step for lit in (*pair.lit_i, *pair.lit_j))) if step]
+    wanted = pair.wanted
     parameters = [
         *stage(job.calibration.camera, job.parameters.match),
-        round(pair.range_m, 6),
+        round(wanted.range_m, 6),
         round(pair.margin_m, 6),
         len(pair.lit_i),
-        pair.next,
-        pair.free,
+        wanted.next,
+        wanted.free,
     ]
 
     def make() -> Made:
-        lit_i, lit_j = (tuple((loaded[lit.row], lit.step) for lit in side) for side in (pair.lit_i, pair.lit_j))
-        return between(job, pair, loaded[pair.i], loaded[pair.j], (lit_i, lit_j))
+        lit_i, lit_j = (tuple((entry(lit.row), lit.step) for lit in side) for side in (pair.lit_i, pair.lit_j))
+        return between(job, pair, entry(wanted.i), entry(wanted.j), (lit_i, lit_j))
 
     return once(job, STEP, VERSION, [*keys, *known], parameters, make)
 
@@ -116,12 +161,12 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
     if "feature_uv" not in a.arrays or "feature_uv" not in b.arrays:
         return Made({}, {"model": "", "matches": 0, "inliers": 0})
     ranges = [range_m for range_m in (a.info["range_m"], b.info["range_m"]) if range_m]
-    at = float(np.mean(ranges)) if ranges else pair.range_m
+    at = float(np.mean(ranges)) if ranges else pair.wanted.range_m
     matched = _matches(job, a, b) if pair.poses is None else _expected(job, pair, pair.poses, a, b, at)
     soundings = _soundings(a, carried[0]), _soundings(b, carried[1])
     found, turned, free = _estimate(job, pair.prior, matched, soundings, at), (False, False), False
     if pair.prior is not None and _weak(found, matched):
-        every = _either_way(job, *(_strongest(each, _OF_NEXT if pair.next else _OF_OTHERS) for each in (a, b)))
+        every = _either_way(job, *(_strongest(each, _OF_NEXT if pair.wanted.next else _OF_OTHERS) for each in (a, b)))
         needed = 2 * max(len(found.inliers) if found else 0, job.parameters.match.min_inliers)
         if len(every.features) > 3 * needed:  # fewer are chance
             best, turned, free = _against_navigation(job, pair, every, needed, soundings, at)
@@ -147,7 +192,7 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
             "matches": count,
             "inliers": len(agreed),
             "turned": list(turned),
-            "free": free or pair.free,
+            "free": free or pair.wanted.free,
         },
     )
 
@@ -247,7 +292,7 @@ def _against_navigation(
         for turned in ((False, False), *_HALF_TURNS):
             if _alike(found, with_half_turn(pair.prior, *turned)):
                 return found, turned, False
-        if pair.next and found.metric:
+        if pair.wanted.next and found.metric:
             return found, (False, False), True
     return None, (False, False), False
 

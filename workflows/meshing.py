@@ -72,7 +72,7 @@ def leaf(
     """A tile of level 0, from surface tiles, mosaic tiles and the images that touch it."""
     own, around, wanted = leaf_inputs(m, place, mosaic_cell_m)
     tile = Tile(own, tuple(images))
-    solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
+    solution = solve.solution(m.job, m.adjusted)
     inputs = [f"{image.row}:{image.key}" for image in images] + [pose_digest(solution, rows_of(tile))]
     inputs += [done.key for _, done in (*ground, *pictures)] + [light.key if light else ""]
 

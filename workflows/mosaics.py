@@ -16,7 +16,7 @@ from ..tasks.grids import Grid
 from ..tasks.navigation import Poses
 from ..tasks.nodes import Lie, Shot
 from . import extract, match, solve
-from .job import Done, Job, LostEntry, Made, code_version, load, once, stage
+from .job import Done, Job, Made, code_version, load, once, read, stage
 from .maps import SURFACE, ground_around, paste
 from .maps_inputs import Image, MapJob, Pair, Tile, context, pose_digest, rows_of
 from .solve import Solution
@@ -30,7 +30,7 @@ _REMEMBERED = 64  # images, of which 0.2 MB each
 
 def lighting(m: MapJob, images: Sequence[Image]) -> Done:
     """What lamps and water do to the mission's colours, from the thumbnails of some of its images."""
-    poses = solve.solution(load(m.job, solve.STEP, m.adjusted)).poses
+    poses = solve.solution(m.job, m.adjusted).poses
     gamma = m.job.parameters.mosaic.gamma
 
     def make() -> Made:
@@ -61,7 +61,7 @@ def _context(m: MapJob, tile: Tile) -> list[Any]:
 
 def align_planar(m: MapJob, images: Sequence[Image], linked: Sequence[Pair]) -> Done:
     """Similarities of all images on the plane of the planar-scene hypothesis."""
-    solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
+    solution = solve.solution(m.job, m.adjusted)
     whole = Tile(Grid(1.0, 0, 0, 1, 1), tuple(images), tuple(linked))
     inputs = [*_inputs(whole, solution), *(f"{pair.i}-{pair.j}:{pair.key}" for pair in linked)]
 
@@ -100,7 +100,7 @@ def _levelled(m: MapJob, linked: Sequence[Pair], poses: Poses, number: dict[int,
 
 def mosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], aligned: Done, light: Done | None) -> Done:
     """One tile of the orthomosaic over the surface tiles `ground`, and of the planar mosaic."""
-    solution = solve.solution(load(m.job, solve.STEP, m.adjusted))
+    solution = solve.solution(m.job, m.adjusted)
     cell = tile.grid.cell_m
     times = {image.row: mosaic.reduction(m.job.calibration.camera, image.range_m, cell) for image in tile.images}
     inputs = [*_inputs(tile, solution), *(done.key for _, done in ground), aligned.key, light.key if light else ""]
@@ -116,11 +116,11 @@ def mosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], alig
         ]
         images = {image.row: image for image in tile.images}
 
-        def read(row: int, reduce: int) -> np.ndarray:
+        def pixels(row: int, reduce: int) -> np.ndarray:
             return read_image(m.job, images[row], reduce)
 
         cv2.setNumThreads(1)
-        ortho, flat = mosaic.compose(plans, read, times, m.job.parameters.mosaic.gamma if light else 1.0)
+        ortho, flat = mosaic.compose(plans, pixels, times, m.job.parameters.mosaic.gamma if light else 1.0)
         arrays = {**ortho._asdict(), "planar_rgb": flat.rgb, "planar_mask": flat.mask}
         return Made(arrays, {"pixels": int(ortho.mask.sum()), "painted": int(ortho.painted.sum())})
 
@@ -167,9 +167,7 @@ def shot(job: Job, image: Image, thumbnail: np.ndarray | None) -> Shot:
 @lru_cache(maxsize=_REMEMBERED)
 def _qualities(store: Store, key: str, lens_json: str) -> np.ndarray:
     """Which pixels of an image are how good, by the key of its extraction: tiles one after the other ask for it."""
-    entry, lens = store.get(extract.STEP, key, ("line_uv",)), Camera.model_validate_json(lens_json)
-    if entry is None:
-        raise LostEntry(f"{store.path(extract.STEP, key)} is gone or damaged; run again to make it anew")
+    entry, lens = read(store, extract.STEP, key, ("line_uv",)), Camera.model_validate_json(lens_json)
     scale = nodes.quality_scale(lens)
     shape = -(-lens.height // scale), -(-lens.width // scale)
     erase = np.zeros(shape, bool)

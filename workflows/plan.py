@@ -11,15 +11,14 @@ from ..catalog.missions import OpenedMission
 from ..schemas.parameters import Parameters
 from ..tasks import navigation, pairs, rotations
 from ..tasks.frames import MapFrame
-from ..tasks.navigation import NavigationPrior, Poses, RelativePrior
+from ..tasks.navigation import NavigationPrior, Poses
 from .extract import ImageTask
-from .match import Lit, PairTask
+from .match import NEAR_SHARE, Wanted, margin_m
 
 # Height above the seabed that is assumed where neither altimeter nor laser tells (paper V: 3 m)
 ASSUMED_RANGE_M = 3.0
 _SEQUENTIAL_REACH = 3
 _BRIDGE_REACH = 16
-_NEAR_SHARE = 0.05  # of the range: so far off is every relative position held possible
 # A laser image taken within this of a texture image sounds for it, seconds
 _LIT_WITHIN_S = 10.0
 
@@ -106,30 +105,23 @@ def _prior(frames: xarray.Dataset, frame: MapFrame, opened: OpenedMission, param
     )
 
 
-def first_pairs(made: Plan, opened: OpenedMission, parameters: Parameters) -> list[PairTask]:
+def first_pairs(made: Plan, opened: OpenedMission, parameters: Parameters) -> list[Wanted]:
     """Pairs to match: by navigation's footprints, or each image with the next few where there is no navigation."""
     rows = np.array([image.row for image in made.images if image.role != "laser"], int)
     if made.prior is None:
         found = pairs.sequential(len(rows), _SEQUENTIAL_REACH)
-        return [PairTask(int(rows[a]), int(rows[b]), None, None, ASSUMED_RANGE_M, 0.0) for a, b in found.images]
+        return [Wanted(int(rows[a]), int(rows[b]), ASSUMED_RANGE_M) for a, b in found.images]
     margin = _margin(made.prior)
     outlines = pairs.footprints(opened.calibration.camera, made.prior.poses, made.range_m)
     known = rows[made.prior.poses.known[rows]]
     following = set(itertools.pairwise(known.tolist()))
     found = sorted({*overlapping(outlines, rows, margin, parameters), *following})
-    lit = _lit(made)
-    tasks = []
-    for i, j in found:
-        prior = navigation.relative(made.prior, i, j)
-        spread = _spread_m(prior, float(made.range_m[i]))
-        poses = _two(made.prior.poses, i, j)
-        beside = lit.get(i, ()), lit.get(j, ())
-        tasks.append(PairTask(i, j, poses, prior, float(made.range_m[i]), spread, *beside, (i, j) in following))
-    return tasks
+    lit, above = _lit(made), made.range_m.tolist()
+    return [Wanted(i, j, above[i], lit.get(i, ()), lit.get(j, ()), (i, j) in following) for i, j in found]
 
 
-def _lit(made: Plan) -> dict[int, tuple[Lit, ...]]:
-    """Of each texture image the laser images taken just before and just after, with navigation's step to them."""
+def _lit(made: Plan) -> dict[int, tuple[int, ...]]:
+    """Of each texture image the laser images taken just before and just after."""
     assert made.prior is not None
     time, known = made.prior.time_s, made.prior.poses.known
     lasers = np.array([image.row for image in made.images if image.role == "laser" and known[image.row]], int)
@@ -138,8 +130,8 @@ def _lit(made: Plan) -> dict[int, tuple[Lit, ...]]:
         if image.role != "texture" or not known[image.row]:
             continue
         after = int(np.searchsorted(lasers, image.row))
-        beside = [row for row in lasers[max(0, after - 1) : after + 1].tolist() if _soon(time, image.row, row)]
-        found[image.row] = tuple(Lit(row, navigation.relative(made.prior, image.row, row)) for row in beside)
+        beside = lasers[max(0, after - 1) : after + 1].tolist()
+        found[image.row] = tuple(row for row in beside if _soon(time, image.row, row))
     return found
 
 
@@ -154,7 +146,7 @@ def chained_pairs(
     poses: Poses,
     range_m: np.ndarray,
     known: Sequence[tuple[int, int]],
-) -> list[PairTask]:
+) -> list[Wanted]:
     """Without navigation: pairs not tried yet that overlap by the chained poses, or may join what is not linked.
 
     Where the chain is broken, as on the turn to the next line, images of both sides are tried that are near in time.
@@ -167,7 +159,7 @@ def chained_pairs(
     bridges = near[linked[near[:, 0]] != linked[near[:, 1]]]
     found += [(int(rows[a]), int(rows[b])) for a, b in bridges]
     tried = set(known)
-    return [PairTask(i, j, None, None, float(range_m[i]), 0.0) for i, j in found if (i, j) not in tried]
+    return [Wanted(i, j, float(range_m[i])) for i, j in found if (i, j) not in tried]
 
 
 def misplaced_pairs(
@@ -177,31 +169,30 @@ def misplaced_pairs(
     poses: Poses,
     range_m: np.ndarray,
     known: Sequence[tuple[int, int]],
-) -> list[PairTask]:
-    """With navigation: pairs not linked that overlap by the adjusted poses, but for navigation were farther apart.
+) -> list[Wanted]:
+    """With navigation: pairs not linked that overlap by the adjusted poses, but for navigation lie elsewhere.
 
     Where navigation jumped or drifted more than it says, its pairs are the wrong ones.
     """
     assert made.prior is not None
     rows = np.array([image.row for image in made.images if image.role != "laser"], int)
     outlines = pairs.footprints(opened.calibration.camera, poses, range_m)
-    corrected, lit, linked = made.prior._replace(poses=poses), _lit(made), set(known)
+    corrected, lit, linked = adjusted_prior(made, poses), _lit(made), set(known)
+    assert corrected is not None
     moved = poses.C_local - made.prior.poses.C_local
-    tasks = []
+    found = []
     for i, j in overlapping(outlines, rows, _margin(made.prior), parameters):
-        if (i, j) in linked or not np.linalg.norm(moved[j] - moved[i]) > _NEAR_SHARE * range_m[i]:
+        off, above = float(np.linalg.norm(moved[j] - moved[i])), float(range_m[i])
+        if (i, j) in linked or not off > NEAR_SHARE * above:
             continue
-        prior = navigation.relative(corrected, i, j)
-        spread = _spread_m(prior, float(range_m[i]))
-        if np.linalg.norm(moved[j] - moved[i]) > spread:
-            beside = lit.get(i, ()), lit.get(j, ())
-            tasks.append(PairTask(i, j, _two(poses, i, j), prior, float(range_m[i]), spread, *beside, free=True))
-    return tasks
+        if off > margin_m(navigation.relative(corrected, i, j), above):
+            found.append(Wanted(i, j, above, lit.get(i, ()), lit.get(j, ()), free=True))
+    return found
 
 
-def _spread_m(prior: RelativePrior, range_m: float) -> float:
-    """How far a relative position may be wrong, metres."""
-    return 2 * float(np.sqrt(prior.covariance[3:, 3:].trace())) + _NEAR_SHARE * range_m
+def adjusted_prior(made: Plan, poses: Poses) -> NavigationPrior | None:
+    """Navigation with adjusted poses in place of its own; None without."""
+    return made.prior and made.prior._replace(poses=poses)
 
 
 def overlapping(
@@ -217,10 +208,6 @@ def _margin(prior: NavigationPrior) -> np.ndarray:
     """How far a footprint may be from where navigation has it, relative to those of neighbouring lines, (n,) m."""
     drift = prior.drift_m_per_sqrt_s * np.sqrt(max(float(np.nanmax(prior.time_s)), 1.0))
     return np.minimum(prior.sigma_horizontal, drift) / 2
-
-
-def _two(poses: Poses, i: int, j: int) -> Poses:
-    return Poses(poses.R_local_camera[[i, j]], poses.C_local[[i, j]])
 
 
 def batches(items: Sequence, size: int) -> list[Sequence]:

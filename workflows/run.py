@@ -25,6 +25,7 @@ from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.products import Quality
 from ..schemas.provenance import Request, Step
+from ..tasks.navigation import NavigationPrior
 from . import (
     dense,
     extract,
@@ -44,7 +45,7 @@ from . import (
 )
 from .executor import Executor, open_executor
 from .footing import Footing, software
-from .job import Done, Job, LostEntry, code_version, load, log
+from .job import Done, Job, LostEntry, code_version, log
 from .plan import Plan
 from .results import Posed, Results
 from .session import Ledger, Session, compute
@@ -217,7 +218,7 @@ def poses(state: Session) -> Posed:
         for k, batch in enumerate(plan.batches(made.images, _IMAGES_A_BATCH))
     ]
     batch_of = {image.row: k // _IMAGES_A_BATCH for k, image in enumerate(made.images)}
-    matches = _match_tasks(state, wanted, extracts, batch_of, "match")
+    matches = _match_tasks(state, wanted, made.prior, extracts, batch_of, "match")
     last = _adjust_task(state, matches, extracts, "adjust")
     *parts, adjusted = compute(state, "poses", [*extracts, *matches, last])
     extracted = _by_row(made, parts[: len(extracts)])
@@ -255,7 +256,8 @@ def _close_loops(
         wanted = more(made, state.opened, job.parameters, poses, ranges, known)
         if not wanted:
             break
-        tasks = _match_tasks(state, wanted, extracts, batch_of, f"match-{turn}")
+        prior = plan.adjusted_prior(made, poses)
+        tasks = _match_tasks(state, wanted, prior, extracts, batch_of, f"match-{turn}")
         again = [pair for part in compute(state, "loops", tasks) for pair in part]
         tried = {(i, j) for i, j, _ in again}
         known += tried
@@ -265,9 +267,15 @@ def _close_loops(
 
 
 def _match_tasks(
-    state: Session, wanted: Sequence[match.PairTask], extracts: Sequence[Any], batch_of: dict[int, int], name: str
+    state: Session,
+    wanted: Sequence[match.Wanted],
+    prior: NavigationPrior | None,
+    extracts: Sequence[Any],
+    batch_of: dict[int, int],
+    name: str,
 ) -> list[Delayed]:
     tasks = []
+    shared = delayed(prior, name=state.key(f"{name}-prior"), traverse=False)  # once, and not with every task
     for k, batch in enumerate(plan.batches(wanted, _PAIRS_A_BATCH)):
         rows = {row for pair in batch for row in pair.rows if row in batch_of}
         needed = sorted({batch_of[row] for row in rows})
@@ -275,17 +283,24 @@ def _match_tasks(
             [i.row for i in state.plan.images[n * _IMAGES_A_BATCH : (n + 1) * _IMAGES_A_BATCH]] for n in needed
         ]
         chosen = [extracts[n] for n in needed]
-        tasks.append(delayed(_match_batch)(state.job, batch, first_rows, chosen, dask_key_name=state.key(name, k)))
+        given = (state.job, batch, first_rows, chosen, shared)
+        tasks.append(delayed(_match_batch)(*given, dask_key_name=state.key(name, k)))
     return tasks
 
 
-def _match_batch(job: Job, batch: Sequence[match.PairTask], rows: list[list[int]], extracted: list[list[Done]]):
+def _match_batch(
+    job: Job,
+    batch: Sequence[match.Wanted],
+    rows: list[list[int]],
+    extracted: list[list[Done]],
+    prior: NavigationPrior | None,
+) -> list[tuple[int, int, Done]]:
     by_row = {
         row: done
         for row_list, part in zip(rows, extracted, strict=True)
         for row, done in zip(row_list, part, strict=True)
     }
-    return match.match_batch(job, batch, by_row)
+    return match.match_batch(job, batch, by_row, prior)
 
 
 def _adjust_task(state: Session, matches: Sequence[Any], extracts: Sequence[Any], name: str) -> Delayed:
@@ -303,7 +318,7 @@ def _adjust(
 
 
 def _solution(job: Job, done: Done) -> solve.Solution:
-    return solve.solution(load(job, done.step, done.key))
+    return solve.solution(job, done.key)
 
 
 def _by_row(made: Plan, parts: Sequence[list[Done]]) -> dict[int, Done]:

@@ -2,17 +2,18 @@
 
 import sys
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from ..catalog.store import Entry
+from ..catalog.store import Store
 from ..tasks import adjust, bundle, crossovers, tracks
 from ..tasks.adjust import Adjusted
 from ..tasks.navigation import NavigationPrior, Poses
 from ..tasks.residuals import Residuals
 from . import extract, match
-from .job import Done, Job, Made, array_digest, code_version, load, once, stage
+from .job import Done, Job, Made, array_digest, code_version, load, once, read, stage
 
 STEP = "adjust"
 VERSION = code_version(sys.modules[__name__])
@@ -102,8 +103,14 @@ def _sights(job: Job, used: Sequence[tuple[int, int, Done]]) -> tracks.Sights:
     return tracks.join(matches)
 
 
-def solution(entry: Entry) -> Solution:
-    """The stored adjustment."""
+def solution(job: Job, key: str) -> Solution:
+    """The stored adjustment; not to be written to, for tiles one after the other share it."""
+    return _solution(job.store, key)
+
+
+@lru_cache(maxsize=2)
+def _solution(store: Store, key: str) -> Solution:
+    entry = read(store, STEP, key)
     arrays = entry.arrays
     poses = Poses(arrays["R"], arrays["C"])
     status, turned = entry.info["status"], arrays["turned"]
