@@ -1,5 +1,6 @@
 """SIFT features of an image and their matches between two images (paper III.E)."""
 
+import itertools
 from typing import NamedTuple
 
 import cv2
@@ -112,12 +113,20 @@ def _tiles(
         return [(np.arange(count), np.arange(len(uv_b)))]
     side = max(expected.reach_px, _SMALLEST_TILE_PX)
     tile = np.floor(expected.uv / side).astype(int)
+    code = tile[:, 0] * (1 << 20) + tile[:, 1]
+    members = np.argsort(code, kind="stable")
+    starts = np.flatnonzero(np.diff(code[members], prepend=code.min(initial=0) - 1))
+    by_u = np.argsort(uv_b[:, 0], kind="stable")
+    u = uv_b[by_u, 0]
     found = []
-    for place in np.unique(tile, axis=0):
-        low = place * side - expected.reach_px
-        near = (uv_b >= low).all(1) & (uv_b <= low + side + 2 * expected.reach_px).all(1)
-        if near.sum() >= 2:
-            found.append((np.flatnonzero((tile == place).all(1)), np.flatnonzero(near)))
+    for start, end in itertools.pairwise([*starts.tolist(), len(code)]):
+        rows = members[start:end]
+        low = tile[rows[0]] * side - expected.reach_px
+        high = low + side + 2 * expected.reach_px
+        near = np.sort(by_u[np.searchsorted(u, low[0]) : np.searchsorted(u, high[0], "right")])
+        near = near[(uv_b[near, 1] >= low[1]) & (uv_b[near, 1] <= high[1])]
+        if len(near) >= 2:
+            found.append((rows, near))
     return found
 
 
