@@ -1,7 +1,8 @@
 """From stored results to a version's folder: every product of FORMATS, with quality figures and provenance."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
@@ -43,6 +44,7 @@ DECIDING = (
     *(contours, mesh_products, tiles3d, report, quality, calibration_quality, residual_quality, unchanged),
 )
 VERSION = code_version(*DECIDING)
+_WRITERS = 2  # each holds a tile
 
 
 def write(results: Results) -> tuple[Folder, bool, Quality]:
@@ -67,12 +69,12 @@ def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
     parts = _parts(results, crs_wkt)
     rows, navigation = _trajectory(results)
     trajectories.write(folder / "trajectory.csv", rows)
-    _write_bathymetry(results, folder, crs_wkt)
-    _write_terrain(results, folder, crs_wkt)
+    wanted = [_write_bathymetry, _write_terrain]
     if not unchanged.take(before, folder, "mosaics", parts["mosaics"]):
-        _write_mosaics(results, folder, crs_wkt)
+        wanted += [_write_mosaic, _write_planar]
     if not unchanged.take(before, folder, "soundings", parts["soundings"]):
-        _write_soundings(results, folder, crs_wkt)
+        wanted.append(_write_soundings)
+    _side_by_side(wanted, results, folder, crs_wkt)
     triangles = before.quality.mesh if before else None
     if triangles is None or not unchanged.take(before, folder, "mesh", parts["mesh"]):
         triangles = mesh_products.write(results, folder, crs_wkt)
@@ -90,6 +92,18 @@ def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
     provenance = provenance.model_copy(update={"parts": parts, "outputs": metadata.output_digests(folder)})
     metadata.write_provenance(folder / "metadata" / "provenance.json", provenance)
     return figures
+
+
+def _side_by_side(write: Sequence[Callable[[Results, Path, str], None]], *given: Any) -> None:
+    """Write groups of files, two at a time: most of it is GDAL's work."""
+    with ThreadPoolExecutor(_WRITERS) as pool:
+        written = [pool.submit(one, *given) for one in write]
+        try:
+            for each in written:
+                each.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _parts(results: Results, crs_wkt: str) -> dict[str, str]:
@@ -177,7 +191,7 @@ def _write_bathymetry(results: Results, folder: Path, crs_wkt: str) -> None:
     for product, layer in layers.items():
         with _writer(folder, f"{product}.tif", surface.grid, crs_wkt, tags) as file:
             for tile, done in surface.tiles:
-                values = load(results.job, maps.SURFACE, done.key).arrays[layer]
+                values = load(results.job, maps.SURFACE, done.key, (layer,)).arrays[layer]
                 # an error of the calibration is the same in all soundings: it goes to the sigma last, never averaged
                 file.write(*_inner(surface.grid, tile), np.hypot(values, common) if layer == "sigma" else values)
     reporting = opened.mission.reporting
@@ -212,21 +226,28 @@ def _write_terrain(results: Results, folder: Path, crs_wkt: str) -> None:
                 files[name].write(*_inner(found.grid, tile), values)
 
 
-def _write_mosaics(results: Results, folder: Path, crs_wkt: str) -> None:
+def _write_mosaic(results: Results, folder: Path, crs_wkt: str) -> None:
     tags = {"MISSION": results.opened.mission.id}
     mosaic, job = results.mapped.mosaic, results.job
     with (
         _writer(folder, "mosaic.tif", mosaic.grid, crs_wkt, tags) as colours,
         _writer(folder, "mosaic-source.tif", mosaic.grid, crs_wkt, tags) as sources,
         _writer(folder, "mosaic-painted.tif", mosaic.grid, crs_wkt, tags) as painted,
-        _writer(folder, "mosaic-planar.tif", mosaic.grid, crs_wkt, tags) as planar,
     ):
         for tile, done in mosaic.tiles:
-            arrays, place = load(job, mosaics.MOSAIC, done.key).arrays, _inner(mosaic.grid, tile)
+            arrays = load(job, mosaics.MOSAIC, done.key, ("rgb", "mask", "source", "painted")).arrays
+            place = _inner(mosaic.grid, tile)
             colours.write(*place, arrays["rgb"], arrays["mask"])
             sources.write(*place, arrays["source"])
             painted.write(*place, arrays["painted"])
-            planar.write(*place, arrays["planar_rgb"], arrays["planar_mask"])
+
+
+def _write_planar(results: Results, folder: Path, crs_wkt: str) -> None:
+    mosaic, tags = results.mapped.mosaic, {"MISSION": results.opened.mission.id}
+    with _writer(folder, "mosaic-planar.tif", mosaic.grid, crs_wkt, tags) as planar:
+        for tile, done in mosaic.tiles:
+            arrays = load(results.job, mosaics.MOSAIC, done.key, ("planar_rgb", "planar_mask")).arrays
+            planar.write(*_inner(mosaic.grid, tile), arrays["planar_rgb"], arrays["planar_mask"])
 
 
 def _sounded(results: Results) -> Iterator[tuple[Done, int]]:
@@ -243,7 +264,8 @@ def _write_soundings(results: Results, folder: Path, crs_wkt: str) -> None:
     west, south = np.floor(np.nanmin(results.mapped.outlines.reshape(-1, 2), axis=0))
     with pointclouds.SoundingsWriter(folder / "soundings.laz", crs_wkt, np.array([west, south, 0.0])) as file:
         for done, row in _sounded(results):
-            arrays = load(results.job, extract.STEP, done.key).arrays
+            names = "laser_X", "laser_uv", "laser_arm", "laser_sigma"
+            arrays = load(results.job, extract.STEP, done.key, names).arrays
             X = arrays["laser_X"] @ poses.R_local_camera[row].T + poses.C_local[row]
             frame = np.full(len(X), row, np.int32)
             sigma = np.hypot(arrays["laser_sigma"], calibration_quality.soundings_sigma(error, dict(arrays)))

@@ -234,7 +234,7 @@ def test_another_cell_size_makes_the_bathymetry_only(reef, tmp_path, monkeypatch
     """Mosaics, mesh and soundings are those of the version before, file by file."""
     out = tmp_path / "out"
     shutil.copytree(reef.out, out)
-    for owner, name in ((products, "_write_mosaics"), (products, "_write_soundings"), (mesh_products, "write")):
+    for owner, name in ((products, "_write_mosaic"), (products, "_write_soundings"), (mesh_products, "write")):
         monkeypatch.setattr(owner, name, None)
     parameters = Parameters.model_validate({"grid": {"cell_m": 0.05}})
     result = run(str(reef.mission), out, parameters, scheduler="sync")
