@@ -5,6 +5,7 @@ linearised and folded into the poses' normal equations by array operations; GTSA
 navigation. All increments of poses are GTSAM's: R exp(w), C + R v.
 """
 
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ Indices = NDArray[np.intp]
 
 _FIRST_DAMPING, _MOST_DAMPING, _HARDER = 1e-5, 1e10, 100.0
 _ITERATIONS = 100
+_ROWS_AT_ONCE = 4096
 _ANCHOR = 1e5  # information of the place of one camera, 1 / m^2: 3 mm
 _NOTHING_LEFT = 1e-9  # share of the anchor's covariance: as much as to be held to 100 m
 _NEAREST_M = 1e-3  # a point at the camera or behind it is taken to be here, which no solution can be
@@ -36,8 +38,7 @@ class Observations(NamedTuple):
     image, track : (M,). is_range : (M,) bool. value : (M, 2) slopes, or the range, metres, and 0. sigma : (M,) of it.
     normal : (M, 3) camera frame: along it the range is taken, where it is not 0; else along the line of sight.
     threshold : sigmas, of Cauchy's kernel.
-    tracks, contacts, images : groups of rows of one tie point, of one tie point in one camera, of one camera.
-    by_image : (M,) rows, camera after camera.
+    tracks, contacts : groups of rows of one tie point, of one tie point in one camera.
     pairs : (P, 2) cameras i < j with tie points in common. first, second : contacts of the same tie point with
         either camera of a pair, all pairs one after the other. ends : (P,) where those of each end.
     """
@@ -51,8 +52,6 @@ class Observations(NamedTuple):
     threshold: float
     tracks: "Groups"
     contacts: "Groups"
-    images: "Groups"
-    by_image: Indices
     pairs: Indices
     first: Indices
     second: Indices
@@ -75,7 +74,6 @@ def observations(
     image, track = image[order], track[order]
     count = int(image.max(initial=0)) + 1
     contacts, tracks = _groups(track * count + image), _groups(track)
-    by_image = np.argsort(image, kind="stable")
     pairs, first, second, ends = _pairs(contacts.number % count, contacts.number // count)
     value = np.concatenate([x, np.column_stack([ranges.range_m, np.zeros(len(sigma_m))])])
     return Observations(
@@ -88,8 +86,6 @@ def observations(
         threshold=threshold,
         tracks=tracks,
         contacts=contacts,
-        images=_groups(image[by_image]),
-        by_image=by_image,
         pairs=pairs,
         first=first,
         second=second,
@@ -121,7 +117,7 @@ class Blocks(NamedTuple):
 
     Attributes
     ----------
-    U : (n, 6, 6) of poses. V : (N, 3, 3) of tie points. W : (Q, 6, 3) of contacts.
+    U : (n, 6, 6) of poses. V : (N, 3, 3) of tie points. W : (Q, 3, 6) of contacts, tie point by pose.
     g_pose : (n, 6), g_point : (N, 3) right-hand sides.
     """
 
@@ -134,8 +130,42 @@ class Blocks(NamedTuple):
 
 def error(o: Observations, poses: Poses, X: Array) -> float:
     """Half the robust sum of squares, as GTSAM counts it."""
-    squared = (_left(o, _seen(o, poses, X)) ** 2).sum(1)
-    return 0.5 * o.threshold**2 * float(np.log1p(squared / o.threshold**2).sum())
+    total = 0.0
+    for part in _parts(o):
+        squared = (_left(part.o, _seen(part.o, poses, X)) ** 2).sum(1)
+        total += float(np.log1p(squared / o.threshold**2).sum())
+    return 0.5 * o.threshold**2 * total
+
+
+class _Part(NamedTuple):
+    """Some whole tie points: their rows as observations, their numbers, their contacts, and where these start."""
+
+    o: Observations
+    number: Indices
+    track_starts: Indices
+    contacts: slice
+    contact_starts: Indices
+
+
+def _parts(o: Observations) -> Iterator[_Part]:
+    """All observations, so few at a time that what is worked on stays small, and in the processor's cache."""
+    tracks, contacts = o.tracks, o.contacts
+    first = 0
+    while first < len(tracks.start):
+        last = max(first + 1, int(np.searchsorted(tracks.start, tracks.start[first] + _ROWS_AT_ONCE, "right")) - 1)
+        begin = int(tracks.start[first])
+        end = int(tracks.start[last]) if last < len(tracks.start) else len(o.track)
+        low, high = np.searchsorted(contacts.start, [begin, end]).tolist()
+        own = slice(begin, end)
+        names = "image", "track", "is_range", "value", "sigma", "normal"
+        yield _Part(
+            o._replace(**{name: getattr(o, name)[own] for name in names}),
+            tracks.number[first:last],
+            tracks.start[first:last] - begin,
+            slice(low, high),
+            contacts.start[low:high] - begin,
+        )
+        first = last
 
 
 def _seen(o: Observations, poses: Poses, X: Array) -> Array:
@@ -161,6 +191,21 @@ def _toward(o: Observations, seen: Array) -> Array:
 
 def linearised(o: Observations, poses: Poses, X: Array) -> Blocks:
     """The normal equations about poses and tie points X (N, 3)."""
+    count = len(poses.C_local)
+    made = Blocks(
+        U=np.zeros((count, 6, 6)),
+        V=np.zeros((len(X), 3, 3)),
+        W=np.empty((len(o.contacts.start), 3, 6)),
+        g_pose=np.zeros((count, 6)),
+        g_point=np.zeros((len(X), 3)),
+    )
+    for part in _parts(o):
+        _add(made, part, poses, X)
+    return made
+
+
+def _add(made: Blocks, part: _Part, poses: Poses, X: Array) -> None:
+    o = part.o
     seen = _seen(o, poses, X)
     left = _left(o, seen)
     weight = 1 / np.sqrt(1 + (left**2).sum(1) / o.threshold**2)
@@ -168,12 +213,13 @@ def linearised(o: Observations, poses: Poses, X: Array) -> Blocks:
     left *= weight[:, None]
     by_pose = np.concatenate([np.cross(by_seen, seen[:, None, :]), -by_seen], axis=2)
     by_point = by_seen @ poses.R_local_camera[o.image].transpose(0, 2, 1)
-    U, g_pose = _of_poses(o, by_pose, left, len(poses.C_local))
-    V, g_point = np.zeros((len(X), 3, 3)), np.zeros((len(X), 3))
-    V[o.tracks.number] = np.add.reduceat(by_point.transpose(0, 2, 1) @ by_point, o.tracks.start)
-    g_point[o.tracks.number] = -np.add.reduceat(np.einsum("mrk,mr->mk", by_point, left), o.tracks.start)
-    W = np.add.reduceat(by_pose.transpose(0, 2, 1) @ by_point, o.contacts.start)
-    return Blocks(U, V, W, g_pose, g_point)
+    made.V[part.number] = np.add.reduceat(by_point.transpose(0, 2, 1) @ by_point, part.track_starts)
+    made.g_point[part.number] = -np.add.reduceat(np.einsum("mrk,mr->mk", by_point, left), part.track_starts)
+    made.W[part.contacts] = np.add.reduceat(by_point.transpose(0, 2, 1) @ by_pose, part.contact_starts)
+    order = np.argsort(o.image, kind="stable")
+    images, A = _groups(o.image[order]), by_pose[order]
+    made.U[images.number] += np.add.reduceat(A.transpose(0, 2, 1) @ A, images.start)
+    made.g_pose[images.number] -= np.add.reduceat(np.einsum("mrk,mr->mk", A, left[order]), images.start)
 
 
 def _by_seen(o: Observations, seen: Array) -> Array:
@@ -186,45 +232,43 @@ def _by_seen(o: Observations, seen: Array) -> Array:
     return found
 
 
-def _of_poses(o: Observations, by_pose: Array, left: Array, count: int) -> tuple[Array, Array]:
-    """Blocks (n, 6, 6) and right-hand sides (n, 6) of the poses."""
-    U, g = np.zeros((count, 6, 6)), np.zeros((count, 6))
-    ends = np.append(o.images.start, len(o.by_image))[1:]
-    for k, start, end in zip(o.images.number.tolist(), o.images.start.tolist(), ends.tolist(), strict=True):
-        rows = o.by_image[start:end]
-        A = by_pose[rows].reshape(-1, 6)
-        U[k], g[k] = A.T @ A, -A.T @ left[rows].ravel()
-    return U, g
-
-
 class Reduced(NamedTuple):
-    """The poses' equations as a GTSAM graph, and what gives the tie points back."""
+    """The poses' equations as a GTSAM graph, and what gives the tie points back.
+
+    Attributes
+    ----------
+    K : (N, 3, 3) with V^-1 = K K'. right : (N, 3) K' g_point. Y : (Q, 3, 6) K' W of the contacts.
+    """
 
     graph: Any
-    V_inverse: Array
-    blocks: Blocks
+    K: Array
+    right: Array
+    Y: Array
 
 
 def reduced(o: Observations, blocks: Blocks, damping: float) -> Reduced:
-    """Tie points eliminated; all diagonals grow by `damping` first (Levenberg)."""
+    """Tie points eliminated; all diagonals grow by `damping` first (Levenberg). The blocks' W is written over."""
     image, track = o.image[o.contacts.start], o.track[o.contacts.start]
     U, V = (_damped(values, damping) for values in (blocks.U, blocks.V))
     V_inverse = np.linalg.inv(V)
     K = np.linalg.cholesky((V_inverse + V_inverse.transpose(0, 2, 1)) / 2)
-    Y = np.ascontiguousarray((blocks.W @ K[track]).transpose(0, 2, 1))  # (Q, 3, 6): V^-1 = K K'
-    right = np.einsum("nji,nj->ni", K, blocks.g_point)[track]
+    right, Y = np.einsum("nji,nj->ni", K, blocks.g_point), blocks.W
+    for start in range(0, len(Y), _ROWS_AT_ONCE):
+        own = slice(start, start + _ROWS_AT_ONCE)
+        Y[own] = K[track[own]].transpose(0, 2, 1) @ Y[own]
     graph, order = gtsam.GaussianFactorGraph(), np.argsort(image, kind="stable")
     own = _groups(image[order])
     ends = np.append(own.start, len(order))[1:]
     for k, start, end in zip(own.number.tolist(), own.start.tolist(), ends.tolist(), strict=True):
-        A, b = Y[order[start:end]].reshape(-1, 6), right[order[start:end]].ravel()
+        contacts = order[start:end]
+        A, b = Y[contacts].reshape(-1, 6), right[track[contacts]].ravel()
         graph.add(gtsam.HessianFactor(k, U[k] - A.T @ A, blocks.g_pose[k] - A.T @ b, 0.0))
     start, nothing, zero = 0, np.zeros((6, 6)), np.zeros(6)
     for (i, j), end in zip(o.pairs.tolist(), o.ends.tolist(), strict=True):
         first, second = (Y[side[start:end]].reshape(-1, 6) for side in (o.first, o.second))
         graph.add(gtsam.HessianFactor(i, j, nothing, -first.T @ second, zero, nothing, zero, 0.0))
         start = end
-    return Reduced(graph, V_inverse, blocks)
+    return Reduced(graph, K, right, Y)
 
 
 def _damped(values: Array, damping: float) -> Array:
@@ -236,11 +280,10 @@ def _damped(values: Array, damping: float) -> Array:
 
 def moved(o: Observations, made: Reduced, X: Array, step: Array) -> Array:
     """The tie points X (N, 3) after the poses made their step (n, 6)."""
-    right = made.blocks.g_point.copy()
-    pulled = np.einsum("qab,qa->qb", made.blocks.W, step[o.image[o.contacts.start]])
+    left, image = made.right.copy(), o.image[o.contacts.start]
     starts = np.searchsorted(o.contacts.start, o.tracks.start)
-    right[o.tracks.number] -= np.add.reduceat(pulled, starts)
-    return X + np.einsum("nab,nb->na", made.V_inverse, right)
+    left[o.tracks.number] -= np.add.reduceat(np.einsum("qab,qb->qa", made.Y, step[image]), starts)
+    return X + np.einsum("nab,nb->na", made.K, left)
 
 
 class State(NamedTuple):
@@ -266,23 +309,27 @@ def solve(fixed: Any, start: State, o: Observations, tolerance: float, afloat: b
     state, damping, ordering = start, _FIRST_DAMPING, None
     before = fixed.error(state.values) + error(o, state.poses, state.X)
     for _ in range(_ITERATIONS):
-        blocks, held = linearised(o, state.poses, state.X), fixed.linearize(state.values)
-        trial, after = state, np.inf
+        held, trial, after = fixed.linearize(state.values), state, np.inf
         while not after <= before:
             if damping > _MOST_DAMPING:
                 return state
-            made = reduced(o, blocks, damping)
-            made.graph.push_back(held)
-            made.graph.add(_anchor(state.poses, _ANCHOR if afloat else 0.0))
-            ordering = ordering or elimination_order(made.graph)
             with suppress(RuntimeError):  # too weakly held for Cholesky's way: damping helps
-                trial = _stepped(o, state, made, made.graph.optimize(ordering))
+                trial, ordering = _tried(o, held, state, damping, _ANCHOR if afloat else 0.0, ordering)
                 after = fixed.error(trial.values) + error(o, trial.poses, trial.X)
             damping *= 1 if after <= before else _HARDER
         gain, before, state, damping = before - after, after, trial, damping / _HARDER
         if gain <= tolerance * before:
             return state
     return state
+
+
+def _tried(o: Observations, held: Any, state: State, damping: float, anchor: float, ordering: Any) -> tuple[State, Any]:
+    """The state after one step, and the order of elimination, found if none is given."""
+    made = reduced(o, linearised(o, state.poses, state.X), damping)
+    made.graph.push_back(held)
+    made.graph.add(_anchor(state.poses, anchor))
+    ordering = ordering or elimination_order(made.graph)
+    return _stepped(o, state, made, made.graph.optimize(ordering)), ordering
 
 
 def _middle(poses: Poses) -> int:

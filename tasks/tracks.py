@@ -8,7 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 Array = NDArray[Any]
-Indices = NDArray[np.intp]
+Indices = NDArray[np.signedinteger[Any]]
 
 
 class Sights(NamedTuple):
@@ -37,7 +37,10 @@ class Sights(NamedTuple):
     def take(self, keep: NDArray[np.bool_]) -> "Sights":
         """The sights that a mask (M,) selects, of tie points that two images still see, numbered anew."""
         kept = self.kept(keep)
-        return Sights(self.image[kept], np.unique(self.track[kept], return_inverse=True)[1], self.uv[kept])
+        track = self.track[kept]
+        left = np.zeros(self.tie_points, bool)
+        left[track] = True
+        return Sights(self.image[kept], (np.cumsum(left) - 1)[track], self.uv[kept])
 
 
 class PairMatches(NamedTuple):
@@ -51,23 +54,34 @@ class PairMatches(NamedTuple):
 
 
 def join(matches: list[PairMatches]) -> Sights:
-    """Tracks of features that are matched with each other, through however many images.
+    """Tracks of features that are matched with each other, through however many images; in single precision.
 
     A track that holds two features of one image has a wrong match in it and is left out.
     """
     if not matches:
-        return Sights(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 2)))
-    sides = [(m.i, m.features[:, 0], m.uv_i) for m in matches] + [(m.j, m.features[:, 1], m.uv_j) for m in matches]
-    image = np.concatenate([np.full(len(number), row) for row, number, _ in sides]).astype(np.int64)
-    number = np.concatenate([number for _, number, _ in sides]).astype(np.int64)
-    uv = np.concatenate([uv for _, _, uv in sides]).astype(float)
-    _, first, node = np.unique(image << 32 | number, return_index=True, return_inverse=True)
-    half = len(node) // 2
-    graph = coo_array((np.ones(half, bool), (node[:half], node[half:])), shape=(len(first),) * 2)
+        return Sights(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 2), np.float32))
+    # a number for every feature that an image may have: all matches of a mission are many, and sorting them is dear
+    each = 1 + max(int(m.features.max(initial=0)) for m in matches)
+    count = each * (1 + max(m.j for m in matches))
+    number = np.int32 if count < 2**31 else np.int64
+
+    def nodes(side: int) -> NDArray[Any]:
+        rows = [(m.i, m.j)[side] for m in matches]
+        parts = zip(matches, rows, strict=True)
+        return np.concatenate([m.features[:, side].astype(number) + row * each for m, row in parts])
+
+    i, j = nodes(0), nodes(1)
+    graph = coo_array((np.ones(len(i), bool), (i, j)), shape=(count, count))
     track = connected_components(graph, directed=False)[1]
-    image, uv = image[first], uv[first]
-    order = np.lexsort((image, track))
-    image, track, uv = image[order], track[order], uv[order]
+    del graph
+    uv = np.zeros((count, 2), np.float32)
+    for node, side in ((i, "uv_i"), (j, "uv_j")):
+        uv[node] = np.concatenate([getattr(m, side) for m in matches])
+    seen = np.zeros(count, bool)
+    seen[i] = seen[j] = True
+    node = np.flatnonzero(seen).astype(number)
+    node = node[np.argsort(track[node], kind="stable")]
+    image, track, uv = node // each, track[node], uv[node]
     twice = (np.diff(track) == 0) & (np.diff(image) == 0)
     torn = np.zeros(int(track[-1]) + 1, bool)
     torn[track[1:][twice]] = True
@@ -94,4 +108,5 @@ def thin(sights: Sights, shape: tuple[int, int], cells: int, most: int) -> Sight
     rank = np.arange(len(order)) - np.searchsorted(ranked, ranked)
     wanted = np.zeros(sights.tie_points, bool)
     wanted[sights.track[order[rank < most]]] = True
-    return sights.take(wanted[sights.track])
+    image, track, uv = sights.take(wanted[sights.track])
+    return Sights(image.astype(np.intp), track.astype(np.intp), uv.astype(float))

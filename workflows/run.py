@@ -243,15 +243,15 @@ def _close_loops(
 ) -> list[tuple[int, int, Done]]:
     """Match what overlaps by the poses so far and adjust again, until nothing new overlaps.
 
-    With navigation that is nothing, unless the poses contradict it. All matches; the adjustments are added to those
-    given.
+    With navigation that is nothing, unless the poses contradict it, and then once. All matches; the adjustments are
+    added to those given.
     """
     job, made = state.job, state.plan
     extracted = _by_row(made, extracts)
     ranges = np.array([mapping.range_of(extracted.get(k), r) for k, r in enumerate(made.range_m)])
     more = plan.chained_pairs if made.prior is None else plan.misplaced_pairs
     known = [(i, j) for i, j, done in matched if made.prior is None or done.info["model"]]
-    for turn in range(_LOOP_ROUNDS):
+    for turn in range(_LOOP_ROUNDS if made.prior is None else 1):
         poses = _solution(job, adjustments[-1]).poses
         wanted = more(made, state.opened, job.parameters, poses, ranges, known)
         if not wanted:
