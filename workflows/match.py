@@ -103,6 +103,7 @@ def match_batch(
     extracted : maps rows to their extraction. prior : navigation, or the poses that stand for it.
     """
     cv2.setNumThreads(1)
+    prior = prior and _copied(prior)
     loaded: dict[int, Entry] = {}
 
     def entry(row: int) -> Entry:
@@ -122,6 +123,13 @@ def match_batch(
         for row in [row for row in loaded if row < min(wanted.rows)]:
             del loaded[row]
     return found
+
+
+def _copied(prior: NavigationPrior) -> NavigationPrior:
+    """In plain order and aligned: the last bits of a product depend on that, and a transfer may change it."""
+    poses = Poses(*(np.array(values, order="C") for values in prior.poses))
+    fields = {name: np.array(v, order="C") for name, v in prior._asdict().items() if isinstance(v, np.ndarray)}
+    return prior._replace(**fields, poses=poses)
 
 
 def _readable(wanted: Wanted, extracted: Mapping[int, Done]) -> Wanted:
