@@ -47,7 +47,7 @@ Tone = Callable[[Array32, Array32, Array32], tuple[Array32, Array32]]
 Read = Callable[[int, int], Pixels]
 
 FEATHER_M: Final = 0.02
-_REACH_FEATHERS: Final = 8  # an image that costs so much more than another does not count
+_REACH_FEATHERS: Final = 6.3  # what costs so much more than another has less than half a 255th, and does not count
 _WIDE_FEATHERS: Final = 8  # of the seam between thumbnails
 _MOST_EVENED: Final = 1.5
 _WEIGHTS: Final = 255

@@ -4,6 +4,7 @@ import os
 from contextlib import suppress
 from typing import Any
 
+import dask.config
 from distributed import LocalCluster
 from distributed.deploy.cluster import Cluster as Running
 
@@ -12,6 +13,9 @@ from ..schemas.problems import InvalidInput, Problem
 
 _FREE_PORT = ":0"
 _STARTS = 5
+# Dask has workers give every freed array back to the system and fetch zeroed pages for the next one, a third of all
+# processor time; kept for the next array, pages cost no more memory. Setting one of the two alone lowers the other
+WORKER_ENVIRONMENT = {"MALLOC_TRIM_THRESHOLD_": 256 * 2**20, "MALLOC_MMAP_THRESHOLD_": 64 * 2**20}
 
 
 def start(described: Cluster) -> Running:
@@ -48,6 +52,8 @@ def local(workers: int | None) -> Cluster:
 
 
 def _local(described: Cluster) -> LocalCluster:
+    environment = "distributed.nanny.pre-spawn-environ"
+    dask.config.set({f"{environment}.{name}": value for name, value in WORKER_ENVIRONMENT.items()})
     options: dict[str, Any] = {
         "n_workers": described.adapt.min if described.adapt else described.workers or 1,
         "threads_per_worker": 1,
@@ -79,9 +85,13 @@ def _jobs(described: Cluster) -> Any:
         "walltime": described.walltime,
         "interface": described.interface,
         "local_directory": described.scratch,
-        "job_script_prologue": list(described.setup),
+        "job_script_prologue": [*_exports(), *described.setup],
         "job_extra_directives": list(described.directives),
         "scheduler_options": {"dashboard_address": _FREE_PORT},
     }
     make = SLURMCluster if described.kind == "slurm" else PBSCluster
     return make(**{name: value for name, value in options.items() if value is not None})
+
+
+def _exports() -> list[str]:
+    return [f"export {name}={value}" for name, value in WORKER_ENVIRONMENT.items()]

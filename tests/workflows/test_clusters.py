@@ -47,6 +47,7 @@ def test_a_job_asks_for_what_the_file_says(kind, wanted):
     for text in wanted.split("|"):
         assert any(line.endswith(text) or text in line for line in lines), f"{text} in\n{script}"
     assert "module load python/3.11" in lines
+    assert lines.index("export MALLOC_TRIM_THRESHOLD_=268435456") < lines.index("module load python/3.11")
     (worker,) = (line for line in lines if sys.executable in line)
     assert address in worker
     for option in ("--nthreads 1", "--nworkers 8", "--memory-limit 4.00GiB", "--local-directory /scratch/seamosaic"):
@@ -59,6 +60,14 @@ def test_a_local_cluster_has_its_workers(tmp_path):
         (worker,) = cluster.workers.values()
         assert (worker.nthreads, worker.memory_manager.memory_limit) == (1, 2 * 1024**3)
     assert list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "value"), [*clusters.WORKER_ENVIRONMENT.items(), ("OMP_NUM_THREADS", 1)])
+def test_workers_keep_freed_memory_for_the_next_array_and_one_thread(name, value):
+    with executor.open_executor(None, 1) as running:
+        assert isinstance(running, executor.ClusterExecutor)
+        (found,) = running.client.run(os.environ.get, name).values()
+    assert found == str(value)
 
 
 @pytest.mark.slow
