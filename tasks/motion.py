@@ -5,7 +5,6 @@ which that plane makes metric; elsewhere from the essential matrix, made metric 
 triangulated depths over all features near soundings. Image points are slopes (x/z, y/z) in the camera frame.
 """
 
-from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import cv2
@@ -16,6 +15,7 @@ from scipy.spatial import KDTree
 
 from ..schemas.parameters import MatchParameters
 from .navigation import RelativePrior
+from .robust_minimum import HUBER, Minimum, minimise
 
 Array = NDArray[Any]
 
@@ -25,11 +25,7 @@ _MIN_SCALE_FEATURES = 5
 _LASER_CONTRADICTS = 0.1  # spread of the depth ratios beyond which a motion is not the right one
 _UNIT_LENGTH_SIGMA = 1e-3
 _MAX_MATCHES = 300
-_SMALL_STEP = 1e-7  # of rotation and translation, for derivatives
-_ENOUGH = 1e-4  # relative decrease of the squares that ends the search: a small part of a sigma
 _PLANE_POINTS = 500
-_HUBER = 2.0  # sigmas of a match from which on it counts less
-_FIRST_DAMPING, _MOST_STEPS = 1e-4, 25
 
 
 class Plane(NamedTuple):
@@ -261,7 +257,7 @@ def _refine_on_plane(
         return ((X_j[:, :2] / X_j[:, 2:]) - x_j[chosen]) / sigma
 
     chosen = _thin(start.inliers)
-    solution = least_squares(lambda step: transfer(step, chosen).ravel(), np.zeros(6), loss="huber", f_scale=_HUBER)
+    solution = least_squares(lambda step: transfer(step, chosen).ravel(), np.zeros(6), loss="huber", f_scale=HUBER)
     R, t = _moved(start.R_i_j, start.t_i_j, solution.x)
     distance = np.linalg.norm(transfer(solution.x, np.arange(len(x_i))), axis=1) * sigma * focal_px
     inliers = np.flatnonzero(distance < parameters.inlier_px)
@@ -313,17 +309,9 @@ def _refine_epipolar(
     return Motion(R, t, covariance, inliers, "essential", metric, scale_sigma)
 
 
-class _Minimum(NamedTuple):
-    """Where a robust sum of squares is least: the step, the residuals there (rows,) and their derivatives (rows, 6)."""
-
-    step: Array
-    residual: Array
-    jacobian: Array
-
-
 def _minimise_sampson(
     x_i: Array, x_j: Array, R: Array, t: Array, focal_px: float, prior: RelativePrior | None
-) -> _Minimum:
+) -> Minimum:
     """The step (6,) from (R, t); the last rows of the residuals are the length of t and, if given, the prior."""
     sigma = _PIXEL_SIGMA / focal_px
     length = 1.0 if prior is None else float(np.linalg.norm(prior.t_i_j))
@@ -344,55 +332,17 @@ def _minimise_sampson(
         off = _log(prior.R_i_j.T @ R_step, prior.R_i_j.T @ (t_step * length - prior.t_i_j))
         return np.append(stretched, whiten @ off)
 
-    return _least_squares(at)
+    return minimise(at)
 
 
-def _least_squares(at: Callable[[Array], Array]) -> _Minimum:
-    """Where Huber's sum over the residuals at(steps), (K, rows) after K steps (K, 6), is least near no step at all.
-
-    Levenberg & Marquardt on reweighted squares; residuals and derivatives are had at one go, which for so few
-    unknowns is a third of the time of scipy's.
-    """
-    probes = np.concatenate([np.zeros((1, 6)), _SMALL_STEP * np.eye(6)])
-
-    def there(step: Array) -> _Minimum:
-        found = at(step + probes)
-        return _Minimum(step, found[0], (found[1:] - found[0]).T / _SMALL_STEP)
-
-    best, damping = there(np.zeros(6)), _FIRST_DAMPING
-    error = _huber(best.residual)
-    for _ in range(_MOST_STEPS):
-        weighted = best.jacobian * _huber_weight(best.residual)[:, None]
-        normal = weighted.T @ best.jacobian
-        normal += damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(6)
-        trial = there(best.step - np.linalg.solve(normal, weighted.T @ best.residual))
-        now = _huber(trial.residual)
-        if not now < error:
-            damping *= 10
-            continue
-        best, error, gain, damping = trial, now, error - now, damping / 10
-        if gain < _ENOUGH * error:
-            break
-    return best
-
-
-def _huber_weight(residual: Array) -> Array:
-    return 1 / np.maximum(np.abs(residual) / _HUBER, 1)
-
-
-def _huber(residual: Array) -> float:
-    size = np.abs(residual)
-    return float(np.where(size < _HUBER, size**2, 2 * _HUBER * size - _HUBER**2).sum())
-
-
-def _epipolar_covariance(found: _Minimum, scale_sigma: float, with_prior: bool) -> Array:
+def _epipolar_covariance(found: Minimum, scale_sigma: float, with_prior: bool) -> Array:
     """Covariance for a translation of unit length: the rows of the prior left out, that of the length exchanged.
 
     Matches beyond Huber's threshold say nothing of it.
     """
     rows = len(found.residual) - (6 if with_prior else 0)
     residual = found.residual[:rows]
-    jacobian = found.jacobian[:rows] * (np.abs(residual) < _HUBER)[:, None]
+    jacobian = found.jacobian[:rows] * (np.abs(residual) < HUBER)[:, None]
     jacobian[-1] *= _UNIT_LENGTH_SIGMA / scale_sigma
     return _covariance(jacobian, residual)
 

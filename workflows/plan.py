@@ -107,15 +107,14 @@ def _prior(frames: xarray.Dataset, frame: MapFrame, opened: OpenedMission, param
 
 def first_pairs(made: Plan, opened: OpenedMission, parameters: Parameters) -> list[Wanted]:
     """Pairs to match: by navigation's footprints, or each image with the next few where there is no navigation."""
-    rows = np.array([image.row for image in made.images if image.role != "laser"], int)
+    rows = _pictures(made)
     if made.prior is None:
         found = pairs.sequential(len(rows), _SEQUENTIAL_REACH)
         return [Wanted(int(rows[a]), int(rows[b]), ASSUMED_RANGE_M) for a, b in found.images]
-    margin = _margin(made.prior)
-    outlines = pairs.footprints(opened.calibration.camera, made.prior.poses, made.range_m)
     known = rows[made.prior.poses.known[rows]]
     following = set(itertools.pairwise(known.tolist()))
-    found = sorted({*overlapping(outlines, rows, margin, parameters), *following})
+    overlap = _overlapping(made, opened, parameters, made.prior.poses, made.range_m, _margin(made.prior))
+    found = sorted({*overlap, *following})
     lit, above = _lit(made), made.range_m.tolist()
     return [Wanted(i, j, above[i], lit.get(i, ()), lit.get(j, ()), (i, j) in following) for i, j in found]
 
@@ -151,9 +150,8 @@ def chained_pairs(
 
     Where the chain is broken, as on the turn to the next line, images of both sides are tried that are near in time.
     """
-    rows = np.array([image.row for image in made.images if image.role != "laser"], int)
-    outlines = pairs.footprints(opened.calibration.camera, poses, range_m)
-    found = overlapping(outlines, rows, np.full(len(range_m), 0.1 * float(np.median(range_m))), parameters)
+    rows, margin = _pictures(made), np.full(len(range_m), 0.1 * float(np.median(range_m)))
+    found = _overlapping(made, opened, parameters, poses, range_m, margin)
     linked = poses.known[rows]
     near = pairs.sequential(len(rows), _BRIDGE_REACH).images
     bridges = near[linked[near[:, 0]] != linked[near[:, 1]]]
@@ -175,13 +173,11 @@ def misplaced_pairs(
     Where navigation jumped or drifted more than it says, its pairs are the wrong ones.
     """
     assert made.prior is not None
-    rows = np.array([image.row for image in made.images if image.role != "laser"], int)
-    outlines = pairs.footprints(opened.calibration.camera, poses, range_m)
     corrected, lit, linked = adjusted_prior(made, poses), _lit(made), set(known)
     assert corrected is not None
     moved = poses.C_local - made.prior.poses.C_local
     found = []
-    for i, j in overlapping(outlines, rows, _margin(made.prior), parameters):
+    for i, j in _overlapping(made, opened, parameters, poses, range_m, _margin(made.prior)):
         off, above = float(np.linalg.norm(moved[j] - moved[i])), float(range_m[i])
         if (i, j) in linked or not off > NEAR_SHARE * above:
             continue
@@ -195,11 +191,22 @@ def adjusted_prior(made: Plan, poses: Poses) -> NavigationPrior | None:
     return made.prior and made.prior._replace(poses=poses)
 
 
-def overlapping(
-    outlines: np.ndarray, rows: np.ndarray, margin_m: np.ndarray, parameters: Parameters
+def _pictures(made: Plan) -> np.ndarray:
+    """Rows of the images that may be matched."""
+    return np.array([image.row for image in made.images if image.role != "laser"], int)
+
+
+def _overlapping(
+    made: Plan,
+    opened: OpenedMission,
+    parameters: Parameters,
+    poses: Poses,
+    range_m: np.ndarray,
+    margin_m: np.ndarray,
 ) -> list[tuple[int, int]]:
-    """Rows (i, j) of the images whose footprints overlap."""
-    p = parameters.match
+    """Rows (i, j) of the images whose footprints overlap by the poses, each footprint margin_m (n,) wider."""
+    rows, p = _pictures(made), parameters.match
+    outlines = pairs.footprints(opened.calibration.camera, poses, range_m)
     found = pairs.overlapping(outlines[rows], margin_m[rows], p.min_overlap, p.max_pairs_per_image)
     return [(int(rows[a]), int(rows[b])) for a, b in found.images]
 
