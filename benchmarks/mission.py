@@ -104,12 +104,18 @@ def measured(mission: Path, out: Path, parameters: Parameters, workers: int) -> 
     return made, {name: round(value, 2) for name, value in figures.items()}
 
 
-def measure(folder: Path, images: int, width: int, workers: int) -> dict[str, Any]:
-    mission, out = folder / f"full-{images}-{width}", folder / "out"
+def simulated(folder: Path, images: int, width: int) -> Path:
+    """So many images of `full`, on lines of the same shape; kept for the next time."""
+    mission = folder / f"full-{images}-{width}"
     if not mission.exists():
         whole = SCENES["full"]
         lines = max(2, round(whole.survey.lines * (images / whole.images) ** 0.5))
         simulate("full", mission, images=images, width=width, survey={"lines": lines})
+    return mission
+
+
+def measure(folder: Path, images: int, width: int, workers: int) -> dict[str, Any]:
+    mission, out = simulated(folder, images, width), folder / "out"
     shutil.rmtree(out, ignore_errors=True)
     quick: dict[str, Any] = {"bathymetry": {"dense": False}}
     decoding = decode_seconds(mission)

@@ -5,6 +5,7 @@ that a place has the same nodes in every tile. What is known at nodes becomes kn
 interpolation (`upsample`).
 """
 
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import cv2
@@ -172,6 +173,7 @@ def quality_cost(quality: Pixels, feather_m: float) -> Array32:
     return _quality_costs(feather_m)[quality]
 
 
+@lru_cache(maxsize=4)
 def _quality_costs(feather_m: float) -> Array32:
     level = np.arange(256)
     cost = _RIM_FEATHERS * feather_m * (BEST - np.clip(level, USABLE, BEST)) / (BEST - USABLE)
