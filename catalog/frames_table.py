@@ -185,6 +185,7 @@ def _table(
         coords={"image": np.array([image.image for image in images], str)},
     )
     table["time"] = ("image", time)
+    table["size"] = ("image", np.array([image.info.get("size") or 0 for image in images], np.int64), {"units": "byte"})
     timed = ~np.isnat(time)
     for name, unit in _UNITS.items():
         column = np.full(len(images), np.nan) if poses is None else np.where(timed, poses.values[name], np.nan)

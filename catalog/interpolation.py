@@ -52,7 +52,7 @@ def at_times(navigation: Navigation, ns: Times, offset_s: float, sigma: Navigati
     navigation : samples; each column is interpolated over the samples that have a value in it.
     ns : (N,) int64 times of the images, nanoseconds since 1970 UTC.
     offset_s : seconds added to navigation times (not to the tide's).
-    sigma : 1-sigma where navigation has no column for it.
+    sigma : 1-sigma where navigation has no value for it.
     tide : height of the sea surface to add to -depth, or None.
 
     Returns
@@ -71,11 +71,9 @@ def at_times(navigation: Navigation, ns: Times, offset_s: float, sigma: Navigati
         values["elevation"] += _interpolate(tide.ns, tide.height, ns, False)
     values["altitude"] = _altitude(times, navigation.altitude, ns)
     for name in SIGMAS:
-        column = navigation.sigma.get(name, np.full(len(times), np.nan))
-        known = np.isfinite(column).any()
-        values[f"sigma_{name}"] = (
-            _interpolate(times, column, ns, False) if known else np.full(len(ns), getattr(sigma, name))
-        )
+        usual = getattr(sigma, name)
+        column = navigation.sigma.get(name, np.full(len(times), usual))
+        values[f"sigma_{name}"] = _interpolate(times, np.where(np.isfinite(column), column, usual), ns, False)
     values = {name: np.where(inside, column, np.nan) for name, column in values.items()}
     complete = times[_complete(navigation)]
     in_gap = inside & _in_gap(complete, ns)

@@ -79,7 +79,10 @@ def look(url: str, out: str) -> Look:
     same = memory.state is not None and memory.state == _state(keys)
     if memory.look is not None and same and _texts_same(url, memory.look.texts):
         return memory.look
-    return _remember(url, out, memory, open_mission(url, memory.images, hashed=None), keys)
+    opened = open_mission(url, dict(memory.images), hashed=None)
+    if recall(url, out) != memory:  # a run has read the images meanwhile
+        return look(url, out)
+    return _remember(url, out, memory, opened, keys)
 
 
 class Memory(NamedTuple):
@@ -134,7 +137,8 @@ def _remember(url: str, out: str, memory: Memory, opened: OpenedMission, keys: M
         inputs=inputs_digest(opened) if read else None,
     )
     present = set(keys.values())
-    images = {key: known for key, known in memory.images.items() if key in present}
+    every = {**recall(url, out).images, **memory.images}  # another run may have read some meanwhile
+    images = {key: known for key, known in every.items() if key in present}
     value = {"images": images, "state": _state(keys), "look": seen._asdict()}
     with suppress(OSError):  # a folder that may only be read, or a full disk: then it is looked at again
         json_files.write_json(_place(url, out), value)

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -14,6 +14,7 @@ from uuid import uuid4
 import numpy as np
 import pyproj
 import rasterio
+import shapely
 from rasterio.coords import BoundingBox
 
 from ..schemas.base import Model
@@ -109,15 +110,15 @@ def write_stac_item(
     with rasterio.open(root / "bathymetry.tif") as file:
         crs, bounds = pyproj.CRS.from_wkt(file.crs.to_wkt()), file.bounds
     ring = _geographic_outline(crs, bounds)
-    longitudes, latitudes = zip(*ring, strict=True)
+    geometry, bbox = _geometry(ring)
     code = _authority_code(crs)
     item = {
         "type": "Feature",
         "stac_version": "1.0.0",
         "stac_extensions": [_PROJECTION, _FILE],
         "id": f"{mission_id}-v{version_number}",
-        "bbox": [min(longitudes), min(latitudes), max(longitudes), max(latitudes)],
-        "geometry": {"type": "Polygon", "coordinates": [[list(point) for point in ring]]},
+        "bbox": bbox,
+        "geometry": geometry,
         "properties": {
             "title": title or mission_id,
             "datetime": None,
@@ -178,6 +179,24 @@ def _geographic_outline(crs: pyproj.CRS, bounds: BoundingBox) -> list[tuple[floa
     longitudes, latitudes = to_geographic.transform(xs, ys)
     points = [(round(float(x), 9), round(float(y), 9)) for x, y in zip(longitudes, latitudes, strict=True)]
     return [*points, points[0]]
+
+
+def _geometry(ring: Sequence[tuple[float, float]]) -> tuple[dict[str, Any], list[float]]:
+    """GeoJSON geometry and bounding box of an outline; across the 180th meridian it is cut there (RFC 7946, 3.1.9)."""
+    longitude, latitude = np.array(ring).T
+    longitude = np.unwrap(longitude, period=360)
+    bbox = [longitude.min(), latitude.min(), longitude.max(), latitude.max()]
+    if bbox[0] >= -180 and bbox[2] <= 180:
+        return {"type": "Polygon", "coordinates": [[list(point) for point in ring]]}, [float(edge) for edge in bbox]
+    whole = shapely.Polygon(np.column_stack([longitude, latitude]))
+    parts = []
+    for turn in (-360, 0, 360):
+        part = whole.intersection(shapely.box(turn - 180, -90, turn + 180, 90))
+        if part.area:
+            edge = shapely.get_coordinates(shapely.orient_polygons(part)) - (turn, 0)
+            parts.append([np.round(edge, 9).tolist()])
+    west, east = ((bbox[k] + 180) % 360 - 180 for k in (0, 2))
+    return {"type": "MultiPolygon", "coordinates": parts}, [float(edge) for edge in (west, bbox[1], east, bbox[3])]
 
 
 def _rfc3339(time: datetime) -> str:

@@ -1,5 +1,6 @@
 """The folder of a mission, local or in an object store: its files by relative path, and its images by pattern."""
 
+import os
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, cast
@@ -101,8 +102,24 @@ class MissionFiles:
         base = f"{self.root}/{folder}".rstrip("/")
         with asking(self.fs, self.url):
             found: dict[str, dict[str, Any]] = self.fs.find(base, maxdepth=depth, detail=True)  # type: ignore[assignment]
+            links = {path for path, info in found.items() if info.get("islink")}
+            found |= {path: self._behind(path, found[path]) for path in links}
         start = len(self.root) + 1
-        return {path[start:]: (path, info) for path, info in found.items()}
+        files = {path[start:]: (path, info) for path, info in found.items() if info["type"] != "directory"}
+        for path in links if depth is None else ():
+            if found[path]["type"] == "directory" and not _is_within(path, os.path.realpath(path)):
+                files |= self._files(path[start:], None)
+        return files
+
+    def _behind(self, path: str, link: dict[str, Any]) -> dict[str, Any]:
+        """The entry of what a link of a local disk leads to, which changes while the link does not."""
+        behind = dict(self.fs.info(os.path.realpath(path))) if self.fs.exists(path) else link
+        return {**behind, "name": path}
+
+
+def _is_within(path: str, folder: str) -> bool:
+    """Whether a path lies in a folder that it leads to."""
+    return os.path.realpath(os.path.dirname(path)).startswith(folder.rstrip(os.sep))
 
 
 def _connect(url: str) -> tuple[AbstractFileSystem, str]:

@@ -133,6 +133,13 @@ def input_warnings(inputs: MissionInputs, images: list[str]) -> list[str]:
         warnings.append("laser images cannot be placed between their neighbours without navigation")
     if mission.tide is not None and mission.vertical_datum is None:
         warnings.append("a tide is given but no vertical_datum: the products cannot say to what heights refer")
+    if inputs.calibration is not None and inputs.calibration.nameless:
+        names = ", ".join(inputs.calibration.nameless[:3])
+        warnings.append(f"covariance in {mission.calibration} of what it does not have, passed over: {names}")
+    if mission.vertical_datum is not None and mission.tide is None and mission.navigation is not None:
+        warnings.append(
+            "a vertical_datum is given but no tide: depths below the sea surface are taken as heights of that datum"
+        )
     if inputs.times is not None:
         names = {name for image in images for name in (image, image.rpartition("/")[2])}
         unused = [name for name in inputs.times if name not in names]

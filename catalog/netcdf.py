@@ -80,7 +80,6 @@ def _height_name(crs: pyproj.CRS) -> str | None:
 def _variables(paths: list[Path], crs: pyproj.CRS, vertical_reference: str) -> Iterator[_Variable]:
     name = _height_name(crs)
     standard = {"standard_name": name} if name else {}
-    error = {"standard_name": f"{name} standard_error"} if name else {}
     yield _Variable(
         "elevation",
         paths[0],
@@ -100,7 +99,11 @@ def _variables(paths: list[Path], crs: pyproj.CRS, vertical_reference: str) -> I
         paths[1],
         "f4",
         NODATA_M,
-        error | {"long_name": "1-sigma of the elevation", "units": "m"},
+        {
+            "long_name": "1-sigma of the elevation relative to the map",
+            "units": "m",
+            "comment": "One cell against another, and the calibration's error; not that of navigation's datum.",
+        },
     )
     yield _Variable(
         "density",

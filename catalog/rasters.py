@@ -84,7 +84,7 @@ _SOURCES: Final = ", ".join(f"{code} {name}" for code, name in SOURCE_NAMES.item
 
 LAYERS: Final[Mapping[str, Layer]] = {
     "bathymetry.tif": Layer(("elevation, positive up",), "float32", NODATA_M, "metre", heights=True),
-    "uncertainty.tif": Layer(("1-sigma of the elevation",), "float32", NODATA_M, "metre"),
+    "uncertainty.tif": Layer(("1-sigma of the elevation relative to the map",), "float32", NODATA_M, "metre"),
     "density.tif": Layer(("soundings in the cell",), "uint32", None),
     "source.tif": Layer((f"source: {_SOURCES}",), "uint8", 0, resampling="nearest", colours=SOURCE_COLOURS),
     **{

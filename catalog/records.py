@@ -2,6 +2,7 @@
 
 from typing import Any, Final, NamedTuple
 
+from ..schemas.problems import InvalidInput, Problem
 from . import json_files
 
 _LAST: Final = "last-run.json"
@@ -39,9 +40,21 @@ def write_last_run(out: str, mission_id: str, last: LastRun) -> None:
 
 
 def read_settings(out: str, mission_id: str) -> dict[str, Any]:
-    """Parameters that were given to this mission alone, by dotted name."""
-    found = json_files.read_json(_url(out, mission_id, _SETTINGS))
-    return found if isinstance(found, dict) else {}
+    """Parameters that were given to this mission alone, by dotted name.
+
+    Raises
+    ------
+    InvalidInput
+        If the file is there and cannot be read: defaults in their place would make another map.
+    """
+    url = _url(out, mission_id, _SETTINGS)
+    found = json_files.read_json(url)
+    if isinstance(found, dict):
+        return found
+    if not json_files.exists(url):
+        return {}
+    remedy = "Correct the file, or remove it."
+    raise InvalidInput([Problem(url, None, "", "no JSON object, or no access", "parameters by dotted name", remedy)])
 
 
 def write_settings(out: str, mission_id: str, settings: dict[str, Any]) -> None:

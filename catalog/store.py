@@ -22,7 +22,7 @@ from fsspec import AbstractFileSystem
 from fsspec.implementations.local import LocalFileSystem
 from numpy.typing import NDArray
 
-from .filesystems import asking, connect, write_whole
+from .filesystems import ObjectStoreError, asking, connect, write_whole
 from .runs import is_dead, run_name
 
 R = TypeVar("R")
@@ -108,9 +108,9 @@ class Store(NamedTuple):
                     if is_dead(path.rpartition("/")[2], time.time() - fs.modified(path).timestamp()):
                         fs.rm_file(path)
 
-    def mark(self) -> str:
-        """Leave a mark by which other processes tell that they see the same store; its name."""
-        name = run_name()
+    def mark(self, name: str = "") -> str:
+        """Leave a mark by which other processes tell that they see the same store, or renew it; its name."""
+        name = name or run_name()
         write_whole(self._mark(name), name.encode(), f"{self.url}/{_SCRATCH}")
         return name
 
@@ -119,6 +119,8 @@ class Store(NamedTuple):
         try:
             with asking(fs, path):
                 return fs.cat_file(path) == name.encode()
+        except ObjectStoreError:
+            raise
         except OSError:
             return False
 

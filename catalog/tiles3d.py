@@ -57,8 +57,10 @@ def write_tileset(
     origin : (3,) map coordinates of the local origin. The elevation is taken for one above the ellipsoid: viewers show
         the map too high or too low by how much its vertical reference is off.
     """
-    low, high = np.min([node.low for node in roots], 0), np.max([node.high for node in roots], 0)
-    coarsest = 2 * max(node.error_m for node in roots)
+    nowhere = np.zeros(3)  # without a triangle the tileset is an empty one
+    low = np.min([node.low for node in roots] or [nowhere], 0)
+    high = np.max([node.high for node in roots] or [nowhere], 0)
+    coarsest = 2 * max((node.error_m for node in roots), default=0.0)
     root: dict[str, Any] = {
         "boundingVolume": {"box": _box(low, high)},
         "geometricError": coarsest,

@@ -160,6 +160,10 @@ class CovarianceBlock(Model):
         return self
 
 
+DISTORTION = {"brown": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4")}
+DISTORTION["flat-port"] = DISTORTION["brown"]
+
+
 class Calibration(Model):
     """A calibration.yaml."""
 
@@ -168,3 +172,14 @@ class Calibration(Model):
     laser: Laser | None = None
     mount: Mount = Mount()
     covariance: tuple[CovarianceBlock, ...] = ()
+
+    @property
+    def nameless(self) -> list[str]:
+        """Parameters of the covariance blocks that the file does not have."""
+        known = {f"camera.{name}" for name in ("fx", "fy", "cx", "cy")}
+        known |= {f"camera.distortion.{name}" for name in DISTORTION[self.camera.model]}
+        known |= {f"mount.translation.{axis}" for axis in "xyz"}
+        known |= {f"mount.rotation.{angle}" for angle in ("roll", "pitch", "yaw")}
+        for sheet in self.laser.sheets if self.laser else ():
+            known |= {f"laser.planes.{sheet.name}.{part}" for part in ("normal.x", "normal.y", "normal.z", "offset")}
+        return [name for block in self.covariance for name in block.parameters if name not in known]

@@ -34,7 +34,7 @@ class Product(NamedTuple):
 
 PRODUCTS: Final[tuple[Product, ...]] = (
     Product("bathymetry.tif", "Elevation of the seabed, metres, positive up", _COG, "data"),
-    Product("uncertainty.tif", "1-sigma of the elevation of each cell, metres", _COG, "data"),
+    Product("uncertainty.tif", "1-sigma of each cell's elevation relative to the map, metres", _COG, "data"),
     Product("density.tif", "Number of soundings in each cell", _COG, "data"),
     Product("source.tif", "Where each cell comes from: 1 laser, 2 image matching, 3 interpolated", _COG, "data"),
     Product("bathymetry.nc", "The four layers above in one CF-NetCDF file", "application/x-netcdf", "data"),

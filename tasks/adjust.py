@@ -32,7 +32,7 @@ from .navigation import NavigationPrior, Poses, relative, with_half_turns
 from .residuals import Residuals
 
 Array = NDArray[Any]
-Status = Literal["adjusted", "navigation", "rejected: no link to the first image"]
+Status = Literal["adjusted", "navigation", "rejected: no link to the placed images"]
 
 _TURN = np.radians(2.0)
 # what calibration and the pinhole leave in a pair motion, whatever its matches say: 0.01 degree and 1 mm
@@ -60,6 +60,7 @@ class Adjusted(NamedTuple):
     ----------
     poses : cameras in the local frame, NaN where `status` is rejected.
     sigma_m : (n, 3) 1-sigma of the camera centres along the local axes.
+    covariance_xy_m2 : (n,) covariance of their x and y, m^2.
     sigma_tilt_rad : (n,) 1-sigma of the angle by which the optical axis may lean, about either image axis.
     status : per image.
     used : (links,) bool, False for links that contradict navigation or each other.
@@ -70,6 +71,7 @@ class Adjusted(NamedTuple):
 
     poses: Poses
     sigma_m: Array
+    covariance_xy_m2: Array
     sigma_tilt_rad: Array
     status: list[Status]
     used: NDArray[np.bool_]
@@ -102,10 +104,11 @@ def adjust(
     kept = {(link.i, link.j) for link in usable}
     poses = read_poses(values, start)
     covariances = _covariances(_total(graph, usable, p.robust_threshold), values, poses)
-    sigma_m, sigma_tilt = sigmas(covariances, poses, navigation)
+    sigma_m, covariance_xy, sigma_tilt = sigmas(covariances, poses, navigation)
     return Adjusted(
         poses=poses,
         sigma_m=sigma_m,
+        covariance_xy_m2=covariance_xy,
         sigma_tilt_rad=sigma_tilt,
         status=_status(usable, poses, navigation),
         used=np.array([(link.i, link.j) in kept for link in links], bool),
@@ -218,17 +221,17 @@ def _agrees(link: Link, values: Any) -> bool:
     return _distance(link.motion, between, link.motion.covariance + _LINK_FLOOR) < 6
 
 
-def sigmas(covariances: Array, poses: Poses, navigation: NavigationPrior | None) -> tuple[Array, Array]:
-    """Sigmas (n, 3) of the camera centres along the local axes and (n,) of the lean of the optical axes.
+def sigmas(covariances: Array, poses: Poses, navigation: NavigationPrior | None) -> tuple[Array, Array, Array]:
+    """Sigmas (n, 3) of the camera centres along the local axes, covariance (n,) of x and y, sigma (n,) of the lean.
 
     covariances : (n, 6, 6) of GTSAM's increments R exp(w), C + R v.
     """
     R = poses.R_local_camera
-    along = np.einsum("nij,njk,nik->ni", R, covariances[:, 3:, 3:], R)
-    position, tilt = np.sqrt(along), np.sqrt((covariances[:, 0, 0] + covariances[:, 1, 1]) / 2)
+    local = R @ covariances[:, 3:, 3:] @ R.swapaxes(1, 2)
+    position, tilt = np.sqrt(np.einsum("nii->ni", local)), np.sqrt((covariances[:, 0, 0] + covariances[:, 1, 1]) / 2)
     if navigation is not None:  # roll and pitch err by a bias too, which no number of images averages down
         tilt = np.hypot(tilt, navigation.sigma_attitude[:, :2].mean(1))
-    return position, tilt
+    return position, local[:, 0, 1], tilt
 
 
 def _covariances(graph: Any, values: Any, poses: Poses) -> Array:
@@ -254,7 +257,7 @@ def _covariances(graph: Any, values: Any, poses: Poses) -> Array:
 
 def _status(links: list[Link], poses: Poses, navigation: NavigationPrior | None) -> list[Status]:
     if navigation is None:
-        return ["adjusted" if ok else "rejected: no link to the first image" for ok in poses.known]
+        return ["adjusted" if ok else "rejected: no link to the placed images" for ok in poses.known]
     linked = np.zeros(len(poses.C_local), bool)
     for link in links:
         linked[[link.i, link.j]] = True

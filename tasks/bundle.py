@@ -97,7 +97,7 @@ def adjust(
         found = refine(camera, chained.poses, sights, soundings, lines, navigation, p)
         if found is None:
             return chained
-        sigma_m, sigma_tilt = sigmas(_covariances(found, navigation, p), found.poses, navigation)
+        sigma_m, covariance_xy, sigma_tilt = sigmas(_covariances(found, navigation, p), found.poses, navigation)
     except RuntimeError:  # GTSAM: a system too near to singular, which counting alone cannot foresee
         return chained
     # a tie point that ended behind a camera is a wrong match that nothing is left of
@@ -109,6 +109,7 @@ def adjust(
     return chained._replace(
         poses=found.poses,
         sigma_m=sigma_m,
+        covariance_xy_m2=covariance_xy,
         sigma_tilt_rad=sigma_tilt,
         reprojection_px=rms_px,
         residuals=remaining.of(count, sights, left_px, found.block.crossed),

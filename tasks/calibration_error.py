@@ -10,14 +10,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.calibration import Camera, CovarianceBlock, Laser, LaserPlane
+from ..schemas.calibration import DISTORTION, Camera, CovarianceBlock, Laser, LaserPlane
 from .camera import rays
 
 Array = NDArray[np.float64]
 
 _NODES: Final = (25, 33)  # rows and columns over the image
-_DISTORTION: Final = {"fisheye": ("k1", "k2", "k3", "k4")}
-_BROWN: Final = ("k1", "k2", "p1", "p2", "k3")
 _STEP: Final = {"fx": 0.1, "fy": 0.1, "cx": 0.1, "cy": 0.1}
 _SMALL: Final = 1e-6
 
@@ -50,9 +48,9 @@ def common_error(camera: Camera, light: Laser, blocks: Sequence[CovarianceBlock]
         chosen = [k for k, name in enumerate(block.parameters) if name.startswith(("camera.", "laser.planes."))]
         if not chosen:
             continue
-        known = True
         covariance = np.array(block.matrix)[np.ix_(chosen, chosen)]
         J = np.stack([_change(camera, light, block.parameters[k], uv) for k in chosen], axis=2)
+        known |= bool(J.any())
         variance += np.einsum("sni,ij,snj->sn", J, covariance, J)
     if not known:
         return None
@@ -91,7 +89,7 @@ def _stepped(camera: Camera, light: Laser, name: str, step: float) -> tuple[Came
     if not name.startswith("camera."):
         return camera, tuple(_moved_sheet(sheet, name, part, step) for sheet in light.sheets)
     if name.startswith("camera.distortion."):
-        names = _DISTORTION.get(camera.model, _BROWN)
+        names = DISTORTION[camera.model]
         values = dict(zip(names, (*camera.distortion, *[0.0] * len(names)), strict=False))
         values = {key: value + step * (key == part) for key, value in values.items()}
         return camera.model_copy(update={"distortion": tuple(values.values())}), light.sheets

@@ -44,7 +44,7 @@ class Totals:
 
     def __init__(self, cells: int):
         self._every = max(1, -(-cells // _SAMPLE))
-        self._sum = self._squares = 0.0
+        self._sum = self._squares = self._largest = 0.0
         self.common = self.gained = self.lost = 0
         self._metres: list[Array] = []
         self._sigmas: list[Array] = []
@@ -55,6 +55,7 @@ class Totals:
         metres = found.metres[both].astype(float)
         sigmas = found.sigmas[both]
         self._sum, self._squares = self._sum + float(metres.sum()), self._squares + float((metres**2).sum())
+        self._largest = max(self._largest, float(np.abs(metres).max(initial=0.0)))
         self.common += int(both.sum())
         self.gained += int((there2 & ~there1).sum())
         self.lost += int((there1 & ~there2).sum())
@@ -71,7 +72,7 @@ class Totals:
             "median": float(np.median(np.concatenate(self._metres))),
             "median_abs": float(np.median(size)),
             "p95_abs": float(np.percentile(size, 95)),
-            "max_abs": float(size.max()),
+            "max_abs": self._largest,
             "rmse": float(np.sqrt(self._squares / self.common)),
         }
 

@@ -162,17 +162,23 @@ def reprocess(
     """Give missions of an archive other parameters, for good, and make new versions, reusing what does not depend on
     them."""
     from . import archive_reprocess
+    from .progress import log_to_stderr
 
+    log_to_stderr(verbose, log_json, bars=False)
+    chosen = options.cluster(cluster, scheduler)
     states = [state for state in _selected(archive, where) if state.look is not None]
     if not states:
         remedy = "Look at `seamosaic status` for what there is."
         raise InvalidInput([Problem("--where", None, "", "no mission", f"missions with {where}", remedy)])
     changed = archive_reprocess.change_parameters(archive, states, set_, dry_run)
     if dry_run:
-        for mission_id, words in changed.items():
-            _console.print(Text(f"{mission_id}: {words}"))
+        if as_json:
+            _console.print_json(json.dumps(changed))
+        else:
+            for mission_id, words in changed.items():
+                _console.print(Text(f"{mission_id}: {words}"))
         return
-    running = Running(scheduler, workers, options.cluster(cluster, scheduler), as_json, log_json, verbose)
+    running = Running(scheduler, workers, chosen, as_json, log_json, verbose)
     run(archive, running, set(changed))
 
 

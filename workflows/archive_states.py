@@ -80,7 +80,10 @@ def assess(archive: OpenedArchive, url: str, ours: bool = False) -> MissionState
         return _invalid(url, "", None, error)
     except OSError as error:  # an object store that does not answer for this one
         return MissionState(url, "", None, INVALID, f"it cannot be read: {error}", "nothing")
-    return _assess(archive, url, look, ours)
+    try:
+        return _assess(archive, url, look, ours)
+    except OSError as error:  # its versions may not be read; the other missions are not to suffer
+        return MissionState(url, look.id, look, INVALID, f"its products cannot be read: {error}", "nothing")
 
 
 def _assess(archive: OpenedArchive, url: str, look: Look, ours: bool) -> MissionState:
@@ -123,7 +126,7 @@ def _judge(
     """State, why, and what the next run does."""
     holder = None if ours else leases.holder(out, look.id)
     if holder is not None and holder.purpose == "run":
-        return RUNNING, str(holder), "wait for that run"
+        return RUNNING, str(holder), "left to that run"
     if asked is not None and number and request.standing(out, look.id, asked):
         return CURRENT, "", "nothing"
     last, make = records.read_last_run(out, look.id), f"make v{number + 1}"

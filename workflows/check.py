@@ -19,6 +19,7 @@ from ..tasks.grids import bathymetry_cell_m, mosaic_cell_m
 from ..tasks.navigation import VehicleState, camera_poses
 from ..tasks.pairs import footprints
 from . import memory_need
+from .rings import rings
 
 
 class Coverage(NamedTuple):
@@ -69,7 +70,15 @@ def check(url: str, parameters: Parameters) -> CheckResult:
         opened = open_mission(url, hashed=False)
     except InvalidInput as invalid:
         return CheckResult(url, None, invalid.problems, (), ())
-    return CheckResult(url, opened, (), tuple(opened.warnings), tuple(_plan(opened, parameters)))
+    seen = coverage(opened)
+    if seen is not None:
+        try:
+            rings(
+                parameters.terrain, memory_need.planned_cell_m(opened.calibration.camera, parameters, seen.altitude_m)
+            )
+        except InvalidInput as invalid:
+            return CheckResult(url, opened, invalid.problems, tuple(opened.warnings), ())
+    return CheckResult(url, opened, (), tuple(opened.warnings), tuple(_plan(opened, parameters, seen)))
 
 
 def coverage(opened: OpenedMission) -> Coverage | None:
@@ -93,7 +102,7 @@ def coverage(opened: OpenedMission) -> Coverage | None:
     return Coverage(camera_height, float(area), ground_sample)
 
 
-def _plan(opened: OpenedMission, parameters: Parameters) -> list[tuple[str, str]]:
+def _plan(opened: OpenedMission, parameters: Parameters, seen: Coverage | None) -> list[tuple[str, str]]:
     mission, frames = opened.mission, opened.frames
     used = frames.isel(image=np.flatnonzero(frames["status"].values == ""))
     roles, counts = np.unique(used["role"].values, return_counts=True)
@@ -109,7 +118,7 @@ def _plan(opened: OpenedMission, parameters: Parameters) -> list[tuple[str, str]
         ("laser", "yes" if opened.calibration.laser is not None else "no: heights come from image matching alone"),
         ("navigation", _navigation(opened)),
         ("map", _map(opened)),
-        *_cells(seen := coverage(opened), parameters),
+        *_cells(seen, parameters),
     ]
     if seen is not None:
         found = memory_need.needs(opened.calibration.camera, parameters, int(counts.sum()), seen.altitude_m)
@@ -132,7 +141,7 @@ def _navigation(opened: OpenedMission) -> str:
 
 def _map(opened: OpenedMission) -> str:
     if opened.crs is None:
-        return "local frame, origin at the first image"
+        return "local frame, origin at the first image placed"
     crs = opened.crs.split('"')[1]
     if opened.vertical is None:
         return f"{crs}; heights below the sea surface at survey time"

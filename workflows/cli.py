@@ -74,6 +74,7 @@ def run(
     from ..catalog.archives import is_archive
     from . import run as runner
 
+    log_to_stderr(verbose, log_json)
     chosen = options.cluster(cluster, scheduler)
     if is_archive(mission):
         _refuse_beside_an_archive(out, params, set_)
@@ -82,7 +83,6 @@ def run(
     if out is None:
         remedy = "Add -o OUT; an archive, which has archive.yaml, names it there."
         raise InvalidInput([Problem("--out", None, "", "nothing", "the folder of the products", remedy)])
-    log_to_stderr(verbose, log_json)
     result = runner.run(mission, out, options.parameters(params, set_), scheduler, workers, chosen)
     log.info("mission=%s step=%s path=%s new=%s", result.quality.mission.id, "done", str(result.path), result.new)
     if as_json:

@@ -73,7 +73,7 @@ def _jobs(described: Cluster) -> Any:
         from dask_jobqueue.pbs import PBSCluster
         from dask_jobqueue.slurm import SLURMCluster
     except ImportError as error:
-        remedy = "Install it with `pip install 'seamosaic[hpc]'`."
+        remedy = "Install it with `.venv/bin/pip install dask-jobqueue`."
         found = f"{described.kind}, without dask-jobqueue"
         raise InvalidInput([Problem("--cluster", None, "kind", found, "an installed dask-jobqueue", remedy)]) from error
     options: dict[str, Any] = {

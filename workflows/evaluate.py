@@ -272,7 +272,7 @@ def _beside_raster(found: _Map, path: Path) -> tuple[Array, Array]:
             window = _window(column, row, file.width, file.height)
             if window is None:
                 return np.zeros(0), np.zeros(0)
-            z = file.read(1, window=window, masked=True).filled(np.nan).astype(float)
+            z = file.read(1, window=window, masked=True).astype(float).filled(np.nan)
     except rasterio.RasterioIOError as error:
         raise _wrong(
             path, str(error), "a raster or a point cloud", "Give a file that GDAL opens, or .las, .laz."

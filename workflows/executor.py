@@ -1,7 +1,7 @@
 """Where Dask runs the graph: threads of this process, a cluster of its own, or a cluster elsewhere."""
 
+import os
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, Protocol
@@ -101,8 +101,8 @@ class ClusterExecutor:
         return min((worker["memory_limit"] for worker in workers if worker["memory_limit"]), default=None)
 
     def _wait(self) -> None:
-        while not self.client.scheduler_info(n_workers=-1)["workers"]:
-            time.sleep(0.2)
+        """Until there is a worker: a cluster that adapts starts one only where a task asks for it."""
+        self.client.submit(os.getpid, pure=False).result()
 
     def compute(self, tasks: Sequence[Delayed], advance: Progress) -> list[Any]:
         with _clearly(self.client):

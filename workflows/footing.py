@@ -45,7 +45,6 @@ def software() -> tuple[tuple[str, str], ...]:
     return ("seamosaic", sha.hexdigest()[:12]), ("python", python), *((name, version(name)) for name in _LIBRARIES)
 
 
-@cache
 def why_not(mission_url: str, store: Store, footing: Footing) -> str:
     """Why this process cannot work on a mission; empty if it can."""
     ours = dict(software())
@@ -64,6 +63,7 @@ def why_not(mission_url: str, store: Store, footing: Footing) -> str:
     return "" if store.is_marked(footing.mark) else f"it does not see the store of results {store.url}"
 
 
+@cache
 def stand(mission_url: str, store: Store, footing: Footing) -> None:
     """Refuse to compute where the footing is another one; looked at once in each process."""
     reason = why_not(mission_url, store, footing)

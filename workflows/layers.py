@@ -5,33 +5,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..schemas.parameters import RingParameters, TerrainParameters
-from ..schemas.problems import InvalidInput, Problem
+from ..schemas.parameters import TerrainParameters
 from ..tasks import contours, derivatives, grids
-from ..tasks.derivatives import Ring
 from ..tasks.grids import Grid
 from .job import Done, Made, code_version, load, once
 from .maps import SURFACE, paste
 from .maps_inputs import MapJob
+from .rings import rings
 
 TERRAIN, CONTOURS = "terrain", "contours"
 _VERSION = code_version(sys.modules[__name__])
-_MOST_CELLS = 1000  # of a ring: a tile is read with such a rim
-
-
-def rings(parameters: TerrainParameters, cell_m: float) -> tuple[Ring, Ring]:
-    """The rings of the two position indices in cells, fine and broad."""
-    return _ring(parameters.fine, "terrain.fine", cell_m), _ring(parameters.broad, "terrain.broad", cell_m)
-
-
-def _ring(given: RingParameters, key: str, cell_m: float) -> Ring:
-    cells = cell_m if given.unit == "metres" else 1.0
-    found = Ring(round(given.inner / cells), max(1, round(given.outer / cells)))
-    if found.outer_cells > _MOST_CELLS:
-        expected = f"at most {_MOST_CELLS} cells of {cell_m:g} m"
-        remedy = "Choose a smaller ring, or larger cells (grid.cell_m)."
-        raise InvalidInput([Problem("parameters", None, f"{key}.outer", f"{given.outer:g} m", expected, remedy)])
-    return found
 
 
 def reach(parameters: TerrainParameters, cell_m: float) -> int:

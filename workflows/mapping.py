@@ -91,13 +91,32 @@ def _outlines(state: Session, solution: Solution, ranges: np.ndarray) -> np.ndar
     return result.reshape(shape)
 
 
-def _touching(outlines: np.ndarray, images: Sequence[Image], grid: Grid, margin_m: float) -> tuple[Image, ...]:
-    """Images whose footprint, grown by a margin, touches the grid."""
-    west, south, east, north = grid.bounds
-    corners = outlines[[image.row for image in images]]
-    near = (corners.min(1) <= (east + margin_m, north + margin_m)).all(1)
-    near &= (corners.max(1) >= (west - margin_m, south - margin_m)).all(1)
-    return tuple(image for image, touches in zip(images, near, strict=True) if touches)
+class _Footprints:
+    """Images, found by where their footprints, grown by a margin for relief, touch the map."""
+
+    def __init__(self, outlines: np.ndarray, images: Sequence[Image]):
+        corners, margin_m = outlines[[image.row for image in images]], _margin(outlines, images)
+        self._images, self._low, self._high = images, corners.min(1) - margin_m, corners.max(1) + margin_m
+
+    def touching(self, grid: Grid) -> tuple[Image, ...]:
+        west, south, east, north = grid.bounds
+        near = (self._low <= (east, north)).all(1) & (self._high >= (west, south)).all(1)
+        return tuple(self._images[k] for k in np.flatnonzero(near).tolist())
+
+
+class _Placed:
+    """Tiles with what is known of them, found by the part of the map that they share."""
+
+    def __init__(self, tiles: Sequence[tuple[Grid, Done]]):
+        self._tiles = tiles
+        edges = [(tile.left, tile.left + tile.width, tile.top - tile.height, tile.top) for tile, _ in tiles]
+        self._left, self._right, self._bottom, self._top = np.array(edges, int).reshape(-1, 4).T
+
+    def overlapping(self, grid: Grid) -> list[tuple[Grid, Done]]:
+        """Those that share cells with a grid of the same cells, in their order."""
+        shared = (self._left < grid.left + grid.width) & (self._right > grid.left)
+        shared &= (self._bottom < grid.top) & (self._top > grid.top - grid.height)
+        return [self._tiles[k] for k in np.flatnonzero(shared).tolist()]
 
 
 def _margin(outlines: np.ndarray, images: Sequence[Image]) -> float:
@@ -118,9 +137,20 @@ def _linked(posed: Posed) -> list[Pair]:
     return [Pair(i, j, keys[i, j]) for i, j in posed.solution.pairs.tolist()]
 
 
-def _of_images(linked: Sequence[Pair], images: Sequence[Image]) -> tuple[Pair, ...]:
-    rows = {image.row for image in images}
-    return tuple(pair for pair in linked if pair.i in rows or pair.j in rows)
+class _Pairs:
+    """Pairs, found by their images."""
+
+    def __init__(self, linked: Sequence[Pair]):
+        self._linked: Sequence[Pair] = linked
+        self._of: dict[int, list[int]] = {}
+        for k, pair in enumerate(linked):
+            self._of.setdefault(pair.i, []).append(k)
+            self._of.setdefault(pair.j, []).append(k)
+
+    def images(self, images: Sequence[Image]) -> tuple[Pair, ...]:
+        """Those of any of some images, in their order."""
+        found = {k for image in images for k in self._of.get(image.row, ())}
+        return tuple(self._linked[k] for k in sorted(found))
 
 
 def _dense(
@@ -139,14 +169,15 @@ def _dense(
     ]
     made: list[Done] = [done for part in compute(state, dense.STEP, tasks) for done in part]
     keys = {(pair.i.row, pair.j.row): done.key for pair, done in zip(described, made, strict=True)}
-    every = max(1, -(-len(linked) // _AGREEMENT_PAIRS))
+    chosen = wanted or linked
+    every = max(1, -(-len(chosen) // _AGREEMENT_PAIRS))
     sampled = [
         (
             dense.DensePair(by_row[pair.i], by_row[pair.j], pair.key),
             keys.get((pair.i, pair.j), ""),
             _beside(posed, by_row, pair),
         )
-        for pair in (wanted or linked)[::every]
+        for pair in chosen[::every]
     ]
     (agreed,) = compute(
         state, dense.AGREEMENT, [delayed(dense.agreement)(m, sampled, dask_key_name=state.key("agreement"))]
@@ -186,17 +217,17 @@ def _surface(
 ) -> Tiles:
     """Bathymetry: cells of each tile, the law of interpolation, then the surface of each tile."""
     size = state.job.parameters.grid.tile_cells
-    margin = _margin(outlines, images)
     bounds = _bounds(outlines, images)
     grid = grids.pad(grids.grid_around(bounds, m.cell_m), 2)
     steps = (maps.CELLS, maps.GROWTH, maps.SURFACE)
     for step in steps:
         state.ledger.begin(step)
     tiles = list(grids.tiles(grid, size))
-    touching = [_touching(outlines, images, tile, margin) for tile in tiles]
+    footprints = _Footprints(outlines, images)
+    touching, pairs_of = [footprints.touching(tile) for tile in tiles], _Pairs(linked)
     cell_tasks = [
         delayed(maps.cells_tile)(
-            m, Tile(tile, seen, _of_images(linked, seen)), agreed, dask_key_name=state.key(f"cells-{m.cell_m:g}", k)
+            m, Tile(tile, seen, pairs_of.images(seen)), agreed, dask_key_name=state.key(f"cells-{m.cell_m:g}", k)
         )
         for k, (tile, seen) in enumerate(zip(tiles, touching, strict=True))
     ]
@@ -207,7 +238,8 @@ def _surface(
             "gives links their scale): there is nothing to map"
         )
     halo = maps.surface.halo_cells(m.max_interpolation_m, m.cell_m)
-    around = [_around(tile, halo, tiles, cells) for tile in tiles]
+    placed = _Placed(list(zip(tiles, cells, strict=True)))
+    around = [placed.overlapping(grids.pad(tile, halo)) for tile in tiles]
     count = max(1, _GROWTH_CELLS // (size * size))
     order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:count]
     samples = [maps.Sample(tiles[k], around[k], outlines[[image.row for image in touching[k]]]) for k in sorted(order)]
@@ -223,20 +255,13 @@ def _surface(
     return Tiles(grid, tuple(zip(tiles, surfaces, strict=True)))
 
 
-def _around(tile: Grid, halo: int, tiles: Sequence[Grid], cells: Sequence[Done]) -> list[tuple[Grid, Done]]:
-    """The tiles that a tile with its halo needs, and their cells."""
-    wide = grids.pad(tile, halo)
-    return [(other, done) for other, done in zip(tiles, cells, strict=True) if grids.intersection(wide, other)]
-
-
 def _layers(state: Session, m: MapJob, surface: Tiles) -> TerrainLayers:
     """Habitat layers of each tile, then its contours, whose interval is one for the whole map."""
     halo = layers.reach(state.job.parameters.terrain, m.cell_m)
     for step in (layers.TERRAIN, layers.CONTOURS):
         state.ledger.begin(step)
 
-    def near(grid: Grid) -> list[tuple[Grid, Done]]:
-        return [(tile, done) for tile, done in surface.tiles if grids.intersection(grid, tile)]
+    near = _Placed(surface.tiles).overlapping
 
     tasks = [
         delayed(layers.terrain_tile)(m, tile, near(grids.pad(tile, halo)), dask_key_name=state.key("terrain", k))
@@ -283,17 +308,16 @@ def _mosaics(
     shown = [image for image in images if image.texture]
     for step in (mosaics.ALIGN, mosaics.MOSAIC):
         state.ledger.begin(step)
-    linked = _of_images(_linked(posed), shown)
+    linked = _Pairs(_linked(posed)).images(shown)
     (aligned,) = compute(
         state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name=state.key("align"))]
     )
     tiles = list(grids.tiles(grid, state.job.parameters.mosaic.tile_cells))
-    margin = _margin(outlines, shown)
-    tasks = []
+    footprints, placed, tasks = _Footprints(outlines, shown), _Placed(ground.tiles), []
     for k, tile in enumerate(tiles):
-        described = Tile(tile, _touching(outlines, shown, tile, margin))
+        described = Tile(tile, footprints.touching(tile))
         around = maps.ground_around(tile, ground.grid.cell_m, m.max_interpolation_m)
-        near = [(t, done) for t, done in ground.tiles if grids.intersection(around, t)]
+        near = placed.overlapping(around)
         tasks.append(
             delayed(mosaics.mosaic_tile)(m, described, near, aligned, light, dask_key_name=state.key("mosaic", k))
         )
@@ -314,14 +338,14 @@ def _mesh(
 ) -> dict[meshing.Place, Done]:
     """The pyramid of mesh tiles, each level from the one below."""
     state.ledger.begin(meshing.MESH)
-    margin, cell = _margin(outlines, images), mosaic.grid.cell_m
+    footprints, cell = _Footprints(outlines, images), mosaic.grid.cell_m
+    grounds, pictured = _Placed(ground.tiles), _Placed(mosaic.tiles)
     finest, *coarser = meshing.levels(list(meshing.leaves(ground.grid)))
     tasks: dict[meshing.Place, Delayed] = {}
     for place in finest:
         own, around, texture = meshing.leaf_inputs(m, place, cell)
-        near = [(tile, done) for tile, done in ground.tiles if grids.intersection(around, tile)]
-        pictures = [(tile, done) for tile, done in mosaic.tiles if grids.intersection(texture, tile)]
-        shown = _touching(outlines, images, own, margin)
+        near, pictures = grounds.overlapping(around), pictured.overlapping(texture)
+        shown = footprints.touching(own)
         given = (m, place, shown, near, pictures, light, cell)
         tasks[place] = delayed(meshing.leaf)(*given, dask_key_name=state.key(f"mesh-{'-'.join(map(str, place))}"))
     below = finest

@@ -39,7 +39,7 @@ def needs(camera: Camera, parameters: Parameters, images: int, range_m: float) -
     """
     pixels = camera.width * camera.height
     usual = grids.bathymetry_cell_m(ground_sample_distance(camera, range_m))
-    cell = usual if parameters.grid.cell_m == "auto" else min(usual, float(parameters.grid.cell_m))
+    cell = min(usual, planned_cell_m(camera, parameters, range_m))
     across = parameters.grid.max_interpolation_m
     reach = grids.max_interpolation_m(range_m) if across == "auto" else float(across)
     side = parameters.grid.tile_cells + 2 * halo_cells(reach, cell)
@@ -55,6 +55,12 @@ def needs(camera: Camera, parameters: Parameters, images: int, range_m: float) -
         ),
         Need(image + _EACH_TEXEL * texels**2, f"a tile of the mosaic ({texels} x {texels})", "mosaic.tile_cells"),
     ]
+
+
+def planned_cell_m(camera: Camera, parameters: Parameters, range_m: float) -> float:
+    """Cell of the bathymetry as far as it is known before the laser tells the range."""
+    usual = grids.bathymetry_cell_m(ground_sample_distance(camera, range_m))
+    return usual if parameters.grid.cell_m == "auto" else float(parameters.grid.cell_m)
 
 
 def refuse_what_cannot_fit(found: list[Need], limit: float | None) -> None:

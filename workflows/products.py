@@ -37,6 +37,7 @@ from . import (
 )
 from .job import Done, code_version, load, stage
 from .results import Results, span, vertical_reference
+from .rings import rings
 from .solve import Solution
 
 DECIDING = (
@@ -153,8 +154,15 @@ def _trajectory(results: Results) -> tuple[list[trajectories.Row], np.ndarray]:
 def _row_pose(frame: Any, solution: Solution, C_map: np.ndarray, k: int) -> trajectories.Pose:
     R_map_local = np.eye(3) if frame.crs is None else frame.R_map_local(C_map)
     w, x, y, z = rotations.quaternion_wxyz(R_map_local @ solution.poses.R_local_camera[k]).tolist()
-    sigma_x, sigma_y, sigma_z = solution.sigma_m[k].tolist()
+    sigma_x, sigma_y, sigma_z = _along_map_axes(solution, R_map_local, k)
     return trajectories.Pose((C_map[0], C_map[1], C_map[2]), (w, x, y, z), (sigma_x, sigma_y, sigma_z))
+
+
+def _along_map_axes(solution: Solution, R_map_local: np.ndarray, k: int) -> list[float]:
+    """1-sigma of a camera's centre: near a pole the map's axes lie any way to east and north."""
+    local = np.diag(solution.sigma_m[k] ** 2)
+    local[0, 1] = local[1, 0] = solution.covariance_xy_m2[k]
+    return np.sqrt(np.diag(R_map_local @ local @ R_map_local.T)).tolist()
 
 
 def _map_points(frame: Any, local: np.ndarray) -> np.ndarray:
@@ -212,14 +220,14 @@ def _write_bathymetry(results: Results, folder: Path, crs_wkt: str) -> None:
 
 def _write_terrain(results: Results, folder: Path, crs_wkt: str) -> None:
     found, job = results.mapped.terrain.layers, results.job
-    fine, broad = layers.rings(job.parameters.terrain, results.mapped.cell_m)
-    rings = {"bpi-fine": fine, "bpi-broad": broad}
+    fine, broad = rings(job.parameters.terrain, results.mapped.cell_m)
+    shown = {"bpi-fine": fine, "bpi-broad": broad}
     with ExitStack() as stack:
         files = {}
         for name in derivatives.LAYERS:
             tags = {"MISSION": results.opened.mission.id}
-            if name in rings:
-                tags["RING"] = quality.ring_text(quality.ring_scale(rings[name], results.mapped.cell_m))
+            if name in shown:
+                tags["RING"] = quality.ring_text(quality.ring_scale(shown[name], results.mapped.cell_m))
             files[name] = stack.enter_context(_writer(folder, f"terrain/{name}.tif", found.grid, crs_wkt, tags))
         for tile, done in found.tiles:
             for name, values in load(job, layers.TERRAIN, done.key).arrays.items():
@@ -318,7 +326,8 @@ def _inputs(opened: OpenedMission) -> Iterator[tuple[str, InputFile]]:
     """Every file of the mission that was read, with its digest and size."""
     files = MissionFiles(opened.url)
     frames = opened.frames
-    images = zip(frames["image"].values.tolist(), frames["sha256"].values.tolist(), strict=True)
-    for name, sha256 in (*opened.input_digests.items(), *images):
+    for name, sha256 in opened.input_digests.items():
+        yield name, InputFile(sha256=sha256, size=int(files.fs.size(f"{files.root}/{name}") or 0))
+    for name, sha256, size in zip(*(frames[of].values.tolist() for of in ("image", "sha256", "size")), strict=True):
         if sha256:
-            yield name, InputFile(sha256=sha256, size=int(files.fs.size(f"{files.root}/{name}") or 0))
+            yield name, InputFile(sha256=sha256, size=size)

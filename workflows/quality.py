@@ -25,8 +25,9 @@ from ..schemas.products import (
     TrajectoryQuality,
 )
 from ..tasks.derivatives import Ring
-from . import calibration_quality, layers, residual_quality
+from . import calibration_quality, residual_quality
 from .results import Results, span, vertical_reference
+from .rings import rings
 
 
 def figures(
@@ -180,7 +181,7 @@ def _bathymetry_quality(folder: Path, cell_m: float) -> BathymetryQuality:
 
 def _terrain_quality(results: Results, folder: Path) -> TerrainQuality:
     cell = results.mapped.cell_m
-    fine, broad = layers.rings(results.job.parameters.terrain, cell)
+    fine, broad = rings(results.job.parameters.terrain, cell)
     slope, vrm, rugosity, roughness = (
         rasters.summarise(folder / f"terrain/{name}.tif").median for name in ("slope", "vrm", "rugosity", "roughness")
     )

@@ -248,7 +248,11 @@ def _bathymetry_figures(quality: Quality) -> Iterator[KeyFigure]:
             f"lowest to highest cell{median}",
         )
     if grid.sigma_median_m is not None:
-        yield KeyFigure("Uncertainty of a cell", f"± {_length(grid.sigma_median_m)}", "median 1-sigma of the elevation")
+        yield KeyFigure(
+            "Uncertainty of a cell",
+            f"± {_length(grid.sigma_median_m)}",
+            "median 1-sigma, relative to the map",
+        )
 
 
 def _other_figures(quality: Quality) -> Iterator[KeyFigure]:
@@ -335,7 +339,7 @@ def _layers(root: Path, geographic: bool) -> Iterator[Picture]:
     yield _picture(
         "Uncertainty",
         figures.quantity_map(uncertainty, geographic, "1-sigma (mm)", scale=1000) if uncertainty is not None else None,
-        "1-sigma of each cell's elevation.",
+        "1-sigma of each cell's elevation, relative to the map; that of navigation's datum is in trajectory.csv.",
         wide=False,
     )
     yield _picture(

@@ -85,7 +85,7 @@ def _utc(time: np.datetime64) -> datetime:
 def vertical_reference(opened: OpenedMission) -> str:
     """What elevations are measured from, in words."""
     if opened.crs is None:
-        return "the first image's centre of projection"
+        return "the centre of projection of the first image placed"
     if opened.vertical is not None:
         return pyproj.CRS.from_wkt(opened.vertical).name
     return "the sea surface at survey time"

@@ -2,6 +2,7 @@
 
 import itertools
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
@@ -48,11 +49,13 @@ from .footing import Footing, software
 from .job import Done, Job, LostEntry, code_version, log
 from .plan import Plan
 from .results import Posed, Results
+from .rings import rings
 from .session import Ledger, Session, compute
 
 _IMAGES_A_BATCH = 4
 _PAIRS_A_BATCH = 16
 _LOOP_ROUNDS = 3
+_RENEW_S = 3600.0
 
 
 class RunResult(NamedTuple):
@@ -135,6 +138,7 @@ def _until_whole(job: Job, opened: OpenedMission, executor: Executor, asked: Req
     """Go over the steps, again where a stored result turns out to be damaged, which makes it anew."""
     made, lost = plan.plan(opened, job.parameters), set()
     typical = float(np.median(made.range_m))
+    rings(job.parameters.terrain, memory_need.planned_cell_m(opened.calibration.camera, job.parameters, typical))
     found = memory_need.needs(opened.calibration.camera, job.parameters, len(made.images), typical)
     memory_need.refuse_what_cannot_fit(found, executor.memory_bytes())
     while True:
@@ -172,11 +176,23 @@ def _footing(store: Store, opened: OpenedMission, out: str) -> Iterator[Footing]
     with _reaching(out):
         store.clean()
         mark = store.mark()
+    ended = threading.Event()
+    renewing = threading.Thread(target=_renew, args=(store, mark, ended), daemon=True)
+    renewing.start()
     try:
         yield Footing(software(), opened.input_digests[MISSION], mark)
     finally:
+        ended.set()
+        renewing.join()
         with suppress(OSError):
             store.unmark(mark)
+
+
+def _renew(store: Store, mark: str, ended: threading.Event) -> None:
+    """Other runs take a mark that is a day old for that of a dead run."""
+    while not ended.wait(_RENEW_S):
+        with suppress(OSError):
+            store.mark(mark)
 
 
 @contextmanager

@@ -24,12 +24,14 @@ class Solution(NamedTuple):
 
     Attributes
     ----------
-    poses, sigma_m, sigma_tilt_rad, status, turned, reprojection_px, residuals : see `tasks.adjust.Adjusted`.
+    poses, sigma_m, covariance_xy_m2, sigma_tilt_rad, status, turned, reprojection_px, residuals : see
+        `tasks.adjust.Adjusted`.
     pairs : (P, 2) rows of the linked pairs that were used.
     """
 
     poses: Poses
     sigma_m: np.ndarray
+    covariance_xy_m2: np.ndarray
     sigma_tilt_rad: np.ndarray
     status: list[str]
     pairs: np.ndarray
@@ -69,6 +71,7 @@ def adjust_all(
             "R": found.poses.R_local_camera,
             "C": found.poses.C_local,
             "sigma_m": found.sigma_m,
+            "covariance_xy_m2": found.covariance_xy_m2,
             "sigma_tilt_rad": found.sigma_tilt_rad,
             "pairs": np.array([[i, j] for i, j, _ in used], int).reshape(-1, 2),
             "turned": found.turned,
@@ -118,6 +121,7 @@ def _solution(store: Store, key: str) -> Solution:
     return Solution(
         poses,
         arrays["sigma_m"],
+        arrays["covariance_xy_m2"],
         arrays["sigma_tilt_rad"],
         status,
         arrays["pairs"],

@@ -126,3 +126,8 @@ def test_nanoseconds_do_not_get_lost() -> None:
     nav = navigation([0, 1], depth=[0, 1e6])
     ns = np.array([T0 + 123_456_789])
     assert at_times(nav, ns, 0.0, SIGMA, None).values["elevation"][0] == pytest.approx(-123456.789, abs=1e-3)
+
+
+def test_an_empty_sigma_is_that_of_the_mission() -> None:
+    nav = navigation([0, 1, 2, 3], sigma={"horizontal": [2.0, 2.0, NAN, NAN]})
+    np.testing.assert_allclose(at(nav, [0, 1, 1.5, 2, 3]).values["sigma_horizontal"], [2, 2, 1.2, 0.4, 0.4])

@@ -99,3 +99,48 @@ def test_a_damaged_memory_is_none(tiny_mission, tmp_path, read):
     file.write_text('{"images": 3}')
     memory.open_known(url, str(out))
     assert len(read) == 20
+
+
+def test_images_behind_a_link_are_files_like_others(tiny_mission, tmp_path, read):
+    card = tmp_path / "card"
+    (tiny_mission / "images").rename(card)
+    (tiny_mission / "images").symlink_to(card)
+    url, out = str(tiny_mission), str(tmp_path / "out")
+    memory.open_known(url, out)
+    assert memory.look(url, out).unread == 0
+    memory.open_known(url, out)
+    assert len(read) == 10
+    image = sorted(card.iterdir())[3]
+    image.write_bytes(image.read_bytes() + b"\0")
+    assert memory.look(url, out).unread == 1
+
+
+def test_a_linked_image_changes_with_what_it_leads_to(tiny_mission, tmp_path, read):
+    image, other = sorted((tiny_mission / "images").iterdir())[3], tmp_path / "other.jpg"
+    image.rename(other)
+    image.symlink_to(other)
+    url, out = str(tiny_mission), str(tmp_path / "out")
+    memory.open_known(url, out)
+    before = other.stat()
+    other.write_bytes(other.read_bytes()[:-1] + b"\0")
+    os.utime(other, ns=(before.st_atime_ns, before.st_mtime_ns + 10**9))
+    assert memory.look(url, out).unread == 1
+
+
+def test_a_link_to_a_folder_that_it_is_in_ends(tiny_mission, tmp_path):
+    (tiny_mission / "again").symlink_to(tiny_mission)
+    assert memory.look(str(tiny_mission), str(tmp_path / "out")).images == 10
+
+
+def test_what_another_run_read_meanwhile_is_kept(tiny_mission, tmp_path, read, monkeypatch):
+    url, out, opening = str(tiny_mission), str(tmp_path / "out"), memory.open_mission
+
+    def slow(*given, **more):
+        if more:
+            memory.open_known(url, out)
+        return opening(*given, **more)
+
+    monkeypatch.setattr(memory, "open_mission", slow)
+    memory.look(url, out)
+    assert memory.look(url, out).unread == 0
+    assert len(read) == 10

@@ -130,3 +130,13 @@ def test_the_product_table_is_whole():
     assert set(rasters.LAYERS) <= set(names)
     assert len(set(names)) == len(names)
     assert {product.role for product in PRODUCTS} <= {"data", "visual", "overview", "metadata"}
+
+
+def test_stac_geometry_across_the_180th_meridian_is_cut_there(tmp_path):
+    ring = [(179.9999, -17.0), (-179.9998, -17.0), (-179.9998, -16.9), (179.9999, -16.9), (179.9999, -17.0)]
+    geometry, (west, south, east, north) = metadata._geometry(ring)
+    assert (west, south, east, north) == pytest.approx((179.9999, -17.0, -179.9998, -16.9))
+    parts = shapely.geometry.shape(geometry)
+    assert (geometry["type"], len(parts.geoms)) == ("MultiPolygon", 2)
+    assert parts.area == pytest.approx(0.0003 * 0.1, rel=1e-6)
+    assert all(part.exterior.is_ccw and abs(part.bounds[0]) <= 180 for part in parts.geoms)

@@ -67,7 +67,7 @@ def test_the_frames_table(tiny_mission: Path) -> None:
     opened = open_mission(str(tiny_mission))
     frames = opened.frames
     assert isinstance(frames, xarray.Dataset)
-    assert set(frames.variables) == {"image", "role", "time", "sha256", "status", *NAVIGATION, *SIGMAS}
+    assert set(frames.variables) == {"image", "role", "time", "size", "sha256", "status", *NAVIGATION, *SIGMAS}
     assert frames.sizes == {"image": 10}
     assert frames["image"].values[0] == "images/V_20260603T021410.136751Z.jpg"
     assert frames["time"].dtype == "datetime64[ns]"
@@ -181,6 +181,17 @@ def test_a_tide_without_a_datum_is_worth_a_word(tiny_mission: Path) -> None:
     edit(tiny_mission / "mission.yaml", ("calibration:", "tide: tide.csv\ncalibration:"))
     (tiny_mission / "tide.csv").write_text("time,height\n2026-06-03T02:14:00Z,1.0\n2026-06-03T02:15:00Z,1.0\n")
     assert "vertical_datum" in open_mission(str(tiny_mission)).warnings[0]
+
+
+def test_a_datum_without_a_tide_is_worth_a_word(tiny_mission: Path) -> None:
+    edit(tiny_mission / "mission.yaml", ("calibration:", "vertical_datum: EPSG:5714\ncalibration:"))
+    assert "no tide" in open_mission(str(tiny_mission)).warnings[0]
+
+
+def test_a_covariance_of_unknown_parameters_is_worth_a_word(tiny_mission: Path) -> None:
+    with (tiny_mission / "calibration.yaml").open("a") as file:
+        file.write("covariance: [{parameters: [laser.planes.left.offset], matrix: [[1.0e-6]]}]\n")
+    assert "laser.planes.left.offset" in open_mission(str(tiny_mission)).warnings[0]
 
 
 def test_strobe_and_laser_images(tiny_mission: Path) -> None:

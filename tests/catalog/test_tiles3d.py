@@ -66,3 +66,10 @@ def test_content_opens_elsewhere(tmp_path):
     part = meshes.Part(vertices, np.tile([0, 0, 1.0], (3, 1)), np.array([[0, 1, 2]]), vertices[:, :2])
     tiles3d.write_content(tmp_path / "0/0_0.glb", part)
     assert len(trimesh.load(tmp_path / "0/0_0.glb", force="mesh").faces) == 1
+
+
+def test_a_map_without_a_triangle_has_an_empty_tileset(tmp_path):
+    tiles3d.write_tileset(tmp_path / "tileset.json", [], UTM, ORIGIN, {})
+    root = json.loads((tmp_path / "tileset.json").read_text())["root"]
+    assert (root["children"], root["geometricError"]) == ([], 0)
+    assert np.isfinite(root["boundingVolume"]["box"]).all()

@@ -144,7 +144,7 @@ def test_without_navigation_an_image_without_link_is_rejected():
     rng, poses = np.random.default_rng(6), _survey()
     links = [link for link in _links(poses, rng) if 23 not in (link.i, link.j)]
     found = _run(poses, links, None)
-    assert found.status[23] == "rejected: no link to the first image"
+    assert found.status[23] == "rejected: no link to the placed images"
     assert np.isnan(found.poses.C_local[23]).all()
     assert found.status.count("adjusted") == 23
 

@@ -77,3 +77,12 @@ def test_nothing_stated_is_nothing_added():
     light = Laser(origin=true.laser.origin, planes=true.laser.planes)
     assert common_error(true.camera, light, []) is None
     assert common_error(true.camera, light, [block(["mount.rotation.roll"], np.eye(1))]) is None
+
+
+def test_a_covariance_of_what_is_not_there_says_nothing():
+    true = calibration()
+    assert true.laser is not None
+    other = block(["laser.planes.left.offset", "camera.k1"], np.eye(2))
+    assert common_error(true.camera, true.laser, [other]) is None
+    named = true.model_copy(update={"covariance": (other, block(["laser.planes.a.offset", *CAMERA], np.eye(6)))})
+    assert named.nameless == ["laser.planes.left.offset", "camera.k1"]

@@ -70,3 +70,10 @@ def test_angle_between_quaternions():
         one, other = (r.as_quat(scalar_first=True) for r in (a, b))
         assert rotations.quaternion_angle_deg(one, other) == pytest.approx(angle, abs=1e-7)
         assert rotations.quaternion_angle_deg(one, -other) == pytest.approx(angle, abs=1e-7)
+
+
+def test_one_spike_is_the_largest_difference_however_large_the_map(maps, monkeypatch):
+    z1, z2, sigma = maps
+    z2[77, 123] = z1[77, 123] - 3.0
+    monkeypatch.setattr(comparison, "_SAMPLE", 600)
+    assert totals(z1, z2, sigma, 50).metres()["max_abs"] == pytest.approx(3.0)

@@ -16,7 +16,7 @@ import fsspec
 import psutil
 import pytest
 import yaml
-from seamosaic.catalog import json_files, leases, memory, records, stac
+from seamosaic.catalog import json_files, leases, memory, records, stac, versions
 from seamosaic.catalog.archives import open_archive
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.workflows import cli, run
@@ -210,6 +210,28 @@ def test_bad_missions_do_not_stop_good_ones(archive):
     assert "give each mission.yaml an id of its own" in outcomes["twin"][1]
     assert outcomes["black"][0] in ("failed", "invalid")
     assert state_of(archive).state == "current"
+
+
+def test_damaged_settings_are_no_defaults(archive):
+    records.write_settings(f"{archive}/products", "plane-0", {"grid.cell_m": 0.05})
+    path = archive / "products/plane-0/settings.json"
+    path.write_text(path.read_text() + ",")
+    state = state_of(archive)
+    assert (state.state, "settings.json" in state.why) == ("invalid", True)
+
+
+def test_products_that_cannot_be_read_are_those_of_one_mission(archive, monkeypatch):
+    newest = versions.newest_version
+
+    def closed(out, mission_id):
+        if mission_id == "plane-0":
+            raise PermissionError(13, "Permission denied")
+        return newest(out, mission_id)
+
+    monkeypatch.setattr(versions, "newest_version", closed)
+    found = {state.id: state for state in assess_all(open_archive(str(archive)))}
+    assert (found["plane-0"].state, "Permission" in found["plane-0"].why) == ("invalid", True)
+    assert found["plane-1"].state == "current"
 
 
 def test_a_failure_is_told_and_tried_again(archive, tiny_mission):

@@ -73,7 +73,7 @@ def test_without_navigation_or_altitude(tiny_mission: Path) -> None:
     path = tiny_mission / "mission.yaml"
     path.write_text(path.read_text().split("navigation:")[0])
     plan = dict(check(str(tiny_mission), Parameters(grid=GridParameters(cell_m=0.5))).plan)
-    assert plan["map"] == "local frame, origin at the first image"
+    assert plan["map"] == "local frame, origin at the first image placed"
     assert (plan["bathymetry cell"], plan["mosaic cell"]) == ("0.5 m", "set by the measured range")
 
 
@@ -84,6 +84,13 @@ def test_some_altitudes_are_enough(tiny_mission: Path) -> None:
     seen = coverage(open_mission(str(tiny_mission), hashed=False))
     assert seen is not None
     assert np.isfinite(seen.area_m2)
+
+
+def test_a_ring_that_is_too_wide_is_told_before_anything_is_computed(tiny_mission: Path) -> None:
+    wide = Parameters.model_validate({"terrain": {"broad": {"inner": 0, "outer": 900, "unit": "metres"}}})
+    result = check(str(tiny_mission), wide)
+    assert [problem.key for problem in result.problems] == ["terrain.broad.outer"]
+    assert "smaller ring" in printed(result)
 
 
 def test_rejections_and_datum_are_told(tiny_mission: Path) -> None:

@@ -62,6 +62,14 @@ def test_a_local_cluster_has_its_workers(tmp_path):
     assert list(tmp_path.iterdir())
 
 
+def test_a_cluster_that_begins_without_workers_gets_one():
+    described = load_model("kind: local\nadapt: {max: 1}\n", "cluster.yaml", Cluster)
+    with executor.open_executor(None, None, described) as running:
+        assert isinstance(running, executor.ClusterExecutor)
+        running._wait()
+        assert running.compute([delayed(sum)([1, 2])], lambda _: None) == [3]
+
+
 @pytest.mark.parametrize(("name", "value"), [*clusters.WORKER_ENVIRONMENT.items(), ("OMP_NUM_THREADS", 1)])
 def test_workers_keep_freed_memory_for_the_next_array_and_one_thread(name, value):
     with executor.open_executor(None, 1) as running:

@@ -171,6 +171,18 @@ def test_reference_raster_in_another_crs(tmp_path: Path, out: Path, truth: Truth
     assert reference["p95_abs_m"] > reference["median_abs_m"]
 
 
+def test_reference_raster_of_whole_metres(tmp_path: Path, out: Path):
+    path = tmp_path / "chart.tif"
+    profile = {"driver": "GTiff", "dtype": "int16", "count": 1, "height": 60, "width": 60, "crs": CRS, "nodata": -999}
+    with rasterio.open(next(out.rglob("bathymetry.tif"))) as file:
+        west, north, z = file.bounds.left - 5, file.bounds.top + 5, float(np.ma.median(file.read(1, masked=True)))
+    with rasterio.open(path, "w", transform=Affine(1, 0, west, 0, -1, north), **profile) as file:
+        file.write(np.full((60, 60), round(z) - 2, np.int16), 1)
+    reference = evaluate(out, path)["reference"]
+    assert reference["cells"] > 500
+    assert reference["vertical_shift_m"] == pytest.approx(z - (round(z) - 2), abs=0.3)
+
+
 def _cloud(path: Path, truth: Truth, shift_m: float) -> Path:
     rng, frame = np.random.default_rng(1), _frame(False)
     X = np.column_stack([rng.uniform(-1.5, 1.5, (60_000, 2)), np.full(60_000, -15.0)])
