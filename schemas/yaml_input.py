@@ -63,7 +63,7 @@ def read_model(content: str | bytes, file: str, model: type[M]) -> Read[M]:
     if not isinstance(document.value, dict):
         expected = expectations(model).at((), {}).text
         found = "an empty file" if document.value is None else shown(document.value)
-        remedy = "Write `key: value` lines; docs and FORMATS show an example to start from."
+        remedy = "Write `key: value` lines; docs/formats.md has all keys, README an example to start from."
         return Read(None, document, [*document.problems, Problem(file, 1, "", found, expected, remedy)])
     values, problems = validate(document.value, model, _Place(document))
     return Read(values, document, sorted([*document.problems, *problems], key=lambda p: p.line or 0))
