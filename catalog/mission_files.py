@@ -98,28 +98,27 @@ class MissionFiles:
             folder = ""
         return sorted(self._files(folder, 1))
 
-    def _files(self, folder: str, depth: int | None) -> dict[str, tuple[str, dict[str, Any]]]:
+    def _files(
+        self, folder: str, depth: int | None, through: tuple[str, ...] = ()
+    ) -> dict[str, tuple[str, dict[str, Any]]]:
+        """Files below a folder; without a depth also behind links to folders, but for those they were come through."""
         base = f"{self.root}/{folder}".rstrip("/")
         with asking(self.fs, self.url):
             found: dict[str, dict[str, Any]] = self.fs.find(base, maxdepth=depth, detail=True)  # type: ignore[assignment]
-            links = {path for path, info in found.items() if info.get("islink")}
+            links = [path for path, info in found.items() if info.get("islink")]
             found |= {path: self._behind(path, found[path]) for path in links}
         start = len(self.root) + 1
         files = {path[start:]: (path, info) for path, info in found.items() if info["type"] != "directory"}
+        through = (*through, os.path.realpath(base))
         for path in links if depth is None else ():
-            if found[path]["type"] == "directory" and not _is_within(path, os.path.realpath(path)):
-                files |= self._files(path[start:], None)
+            if found[path]["type"] == "directory" and os.path.realpath(path) not in through:
+                files |= self._files(path[start:], None, through)
         return files
 
     def _behind(self, path: str, link: dict[str, Any]) -> dict[str, Any]:
         """The entry of what a link of a local disk leads to, which changes while the link does not."""
         behind = dict(self.fs.info(os.path.realpath(path))) if self.fs.exists(path) else link
         return {**behind, "name": path}
-
-
-def _is_within(path: str, folder: str) -> bool:
-    """Whether a path lies in a folder that it leads to."""
-    return os.path.realpath(os.path.dirname(path)).startswith(folder.rstrip(os.sep))
 
 
 def _connect(url: str) -> tuple[AbstractFileSystem, str]:

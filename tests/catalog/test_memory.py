@@ -127,8 +127,11 @@ def test_a_linked_image_changes_with_what_it_leads_to(tiny_mission, tmp_path, re
     assert memory.look(url, out).unread == 1
 
 
-def test_a_link_to_a_folder_that_it_is_in_ends(tiny_mission, tmp_path):
+def test_links_that_lead_round_end(tiny_mission, tmp_path):
     (tiny_mission / "again").symlink_to(tiny_mission)
+    (tmp_path / "beside").mkdir()
+    (tmp_path / "beside" / "back").symlink_to(tiny_mission / "images")
+    (tiny_mission / "images" / "out").symlink_to(tmp_path / "beside")
     assert memory.look(str(tiny_mission), str(tmp_path / "out")).images == 10
 
 
