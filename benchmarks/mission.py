@@ -11,6 +11,7 @@ counts as one of its own (`each_image_anew`), as those of a real mission are.
 
 import argparse
 import json
+import multiprocessing
 import os
 import resource
 import shutil
@@ -18,6 +19,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -110,7 +112,9 @@ def simulated(folder: Path, images: int, width: int) -> Path:
     if not mission.exists():
         whole = SCENES["full"]
         lines = max(2, round(whole.survey.lines * (images / whole.images) ** 0.5))
-        simulate("full", mission, images=images, width=width, survey={"lines": lines})
+        # in a process of its own, whose memory is not that of the run
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            pool.submit(simulate, "full", mission, images=images, width=width, survey={"lines": lines}).result()
     return mission
 
 

@@ -18,8 +18,8 @@ from ..tasks.frames import MapFrame
 from ..tasks.grids import bathymetry_cell_m, mosaic_cell_m
 from ..tasks.navigation import VehicleState, camera_poses
 from ..tasks.pairs import footprints
+from ..tasks.rings import rings
 from . import memory_need
-from .rings import rings
 
 
 class Coverage(NamedTuple):

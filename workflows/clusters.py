@@ -10,12 +10,10 @@ from distributed.deploy.cluster import Cluster as Running
 
 from ..schemas.cluster import Cluster
 from ..schemas.problems import InvalidInput, Problem
+from .heap import WORKER_ENVIRONMENT
 
 _FREE_PORT = ":0"
 _STARTS = 5
-# Dask has workers give every freed array back to the system and fetch zeroed pages for the next one, a third of all
-# processor time; kept for the next array, pages cost no more memory. Setting one of the two alone lowers the other
-WORKER_ENVIRONMENT = {"MALLOC_TRIM_THRESHOLD_": 256 * 2**20, "MALLOC_MMAP_THRESHOLD_": 64 * 2**20}
 
 
 def start(described: Cluster) -> Running:

@@ -8,10 +8,10 @@ import numpy as np
 from ..schemas.parameters import TerrainParameters
 from ..tasks import contours, derivatives, grids
 from ..tasks.grids import Grid
+from ..tasks.rings import rings
 from .job import Done, Made, code_version, load, once
 from .maps import SURFACE, paste
 from .maps_inputs import MapJob
-from .rings import rings
 
 TERRAIN, CONTOURS = "terrain", "contours"
 _VERSION = code_version(sys.modules[__name__])

@@ -22,6 +22,7 @@ from ..schemas.products import Quality
 from ..schemas.provenance import InputFile, Provenance
 from ..tasks import contours, derivatives, rotations
 from ..tasks.grids import Grid
+from ..tasks.rings import rings
 from . import (
     calibration_quality,
     extract,
@@ -37,7 +38,6 @@ from . import (
 )
 from .job import Done, code_version, load, stage
 from .results import Results, span, vertical_reference
-from .rings import rings
 from .solve import Solution
 
 DECIDING = (

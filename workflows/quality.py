@@ -25,9 +25,9 @@ from ..schemas.products import (
     TrajectoryQuality,
 )
 from ..tasks.derivatives import Ring
+from ..tasks.rings import rings
 from . import calibration_quality, residual_quality
 from .results import Results, span, vertical_reference
-from .rings import rings
 
 
 def figures(

@@ -27,9 +27,11 @@ from ..schemas.problems import InvalidInput, Problem
 from ..schemas.products import Quality
 from ..schemas.provenance import Request, Step
 from ..tasks.navigation import NavigationPrior
+from ..tasks.rings import rings
 from . import (
     dense,
     extract,
+    heap,
     layers,
     mapping,
     maps,
@@ -49,7 +51,6 @@ from .footing import Footing, software
 from .job import Done, Job, LostEntry, code_version, log
 from .plan import Plan
 from .results import Posed, Results
-from .rings import rings
 from .session import Ledger, Session, compute
 
 _IMAGES_A_BATCH = 4
@@ -330,7 +331,11 @@ def _adjust(
     job: Job, count: int, rows: list[int], matched: list, extracted: list, prior: Any, R_first: np.ndarray
 ) -> Done:
     by_row = dict(zip(rows, itertools.chain.from_iterable(extracted), strict=True))
-    return solve.adjust_all(job, count, list(itertools.chain.from_iterable(matched)), by_row, prior, R_first)
+    heap.give_back()
+    try:
+        return solve.adjust_all(job, count, list(itertools.chain.from_iterable(matched)), by_row, prior, R_first)
+    finally:
+        heap.give_back()
 
 
 def _solution(job: Job, done: Done) -> solve.Solution:

@@ -63,8 +63,7 @@ def adjust_all(
     parameters = stage(job.calibration.camera, job.parameters.adjust)
 
     def make() -> Made:
-        links = [match.link(i, j, load(job, match.STEP, done.key)) for i, j, done in linked]
-        chained = adjust.adjust(count, links, prior, R_first, job.parameters.adjust)
+        chained = _chained(job, count, linked, prior, R_first)
         used = [pair for pair, ok in zip(linked, chained.used, strict=True) if ok]
         found = _bundle(job, chained, used, lit, prior)
         arrays = {
@@ -81,6 +80,13 @@ def adjust_all(
         return Made(arrays, {"status": found.status, "reprojection_px": found.reprojection_px})
 
     return once(job, STEP, VERSION, [str(count), *inputs], parameters, make)
+
+
+def _chained(
+    job: Job, count: int, linked: Sequence[tuple[int, int, Done]], prior: NavigationPrior | None, R_first: np.ndarray
+) -> Adjusted:
+    links = [match.link(i, j, load(job, match.STEP, done.key)) for i, j, done in linked]
+    return adjust.adjust(count, links, prior, R_first, job.parameters.adjust)
 
 
 def _bundle(

@@ -10,7 +10,7 @@ from dask.delayed import delayed
 from seamosaic.schemas.cluster import Cluster
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.yaml_input import load_model
-from seamosaic.workflows import clusters, executor
+from seamosaic.workflows import clusters, executor, heap
 
 SLURM = """\
 kind: slurm
@@ -70,7 +70,7 @@ def test_a_cluster_that_begins_without_workers_gets_one():
         assert running.compute([delayed(sum)([1, 2])], lambda _: None) == [3]
 
 
-@pytest.mark.parametrize(("name", "value"), [*clusters.WORKER_ENVIRONMENT.items(), ("OMP_NUM_THREADS", 1)])
+@pytest.mark.parametrize(("name", "value"), [*heap.WORKER_ENVIRONMENT.items(), ("OMP_NUM_THREADS", 1)])
 def test_workers_keep_freed_memory_for_the_next_array_and_one_thread(name, value):
     with executor.open_executor(None, 1) as running:
         assert isinstance(running, executor.ClusterExecutor)

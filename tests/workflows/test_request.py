@@ -14,7 +14,7 @@ from seamosaic.workflows import job, products, request, run
 NEUTRAL = {
     *(f"catalog.{name}" for name in ("json_files", "leases", "records", "store", "versions")),
     *(f"catalog.{name}" for name in ("filesystems", "publishing", "runs")),
-    *("schemas.cluster", "workflows.clusters", "workflows.footing"),
+    *("schemas.cluster", "workflows.clusters", "workflows.footing", "workflows.heap"),
     *(f"schemas.{name}" for name in ("base", "expectation", "parameters", "problems", "products", "provenance")),
     *(f"workflows.{name}" for name in ("executor", "job", "memory_need", "progress", "request", "session")),
 }

@@ -2,7 +2,7 @@
 
 from ..schemas.parameters import RingParameters, TerrainParameters
 from ..schemas.problems import InvalidInput, Problem
-from ..tasks.derivatives import Ring
+from .derivatives import Ring
 
 _MOST_CELLS = 1000  # of a ring: a tile is read with such a rim
 
