@@ -50,9 +50,10 @@ class Ranges(NamedTuple):
 
 def slopes(X: Array) -> Array:
     """Rise of the seabed to the east and north (N, 2) at points X (N, 3), by the plane of their neighbours."""
-    if len(X) <= _NEIGHBOURS:
-        return np.zeros((len(X), 2))
-    nearest = _neighbours(X)[1]
+    return _slopes(X, _neighbours(X)[1]) if len(X) > _NEIGHBOURS else np.zeros((len(X), 2))
+
+
+def _slopes(X: Array, nearest: Indices) -> Array:
     around = X[nearest] - X[nearest].mean(1, keepdims=True)
     xy, z = around[:, :, :2], around[:, :, 2]
     normal = np.einsum("nki,nkj->nij", xy, xy)
@@ -62,9 +63,9 @@ def slopes(X: Array) -> Array:
     return np.clip(found, -_STEEPEST, _STEEPEST)
 
 
-def _neighbours(X: Array) -> tuple[Array, Indices]:
-    """Distance to the farthest of the nearest points (N,), and which these are (N, 12)."""
-    distance, nearest = KDTree(X[:, :2]).query(X[:, :2], k=_NEIGHBOURS)
+def _neighbours(X: Array, tree: KDTree | None = None) -> tuple[Array, Indices]:
+    """Distance to the farthest of the nearest points (N,), and which these are (N, 12). tree : of their x and y."""
+    distance, nearest = (tree or KDTree(X[:, :2])).query(X[:, :2], k=_NEIGHBOURS)
     return np.asarray(distance)[:, -1], np.asarray(nearest)
 
 
@@ -76,7 +77,9 @@ def measure(poses: Poses, X: Array, soundings: Mapping[int, Array], most: int) -
     """
     found = [(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0), np.zeros(0), np.zeros((0, 2)))]
     if len(X) > _NEIGHBOURS:
-        tree, slope, width = KDTree(X[:, :2]), slopes(X), _neighbours(X)[0]
+        tree = KDTree(X[:, :2])
+        width, nearest = _neighbours(X, tree)
+        slope = _slopes(X, nearest)
         for k, own in soundings.items():
             if len(own) and np.isfinite(poses.C_local[k]).all():
                 track, range_m, away_m = _of_image(poses, k, own, X, slope, tree, most, width)

@@ -66,7 +66,8 @@ def _navigation(poses, rng):
 def _chained(start):
     count = len(start.C_local)
     sigma = np.full((count, 3), 1.0)
-    return Adjusted(start, sigma, sigma[:, 0], ["adjusted"] * count, np.ones(0, bool), np.zeros(count, bool))
+    ok, used, turned = ["adjusted"] * count, np.ones(0, bool), np.zeros(count, bool)
+    return Adjusted(start, sigma, np.zeros(count), sigma[:, 0], ok, used, turned)
 
 
 def _rms(found, true):
