@@ -137,8 +137,7 @@ def _remember(url: str, out: str, memory: Memory, opened: OpenedMission, keys: M
         inputs=inputs_digest(opened) if read else None,
     )
     present = set(keys.values())
-    every = {**recall(url, out).images, **memory.images}  # another run may have read some meanwhile
-    images = {key: known for key, known in every.items() if key in present}
+    images = {key: known for key, known in memory.images.items() if key in present}
     value = {"images": images, "state": _state(keys), "look": seen._asdict()}
     with suppress(OSError):  # a folder that may only be read, or a full disk: then it is looked at again
         json_files.write_json(_place(url, out), value)

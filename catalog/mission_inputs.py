@@ -133,8 +133,8 @@ def input_warnings(inputs: MissionInputs, images: list[str]) -> list[str]:
         warnings.append("laser images cannot be placed between their neighbours without navigation")
     if mission.tide is not None and mission.vertical_datum is None:
         warnings.append("a tide is given but no vertical_datum: the products cannot say to what heights refer")
-    if inputs.calibration is not None and inputs.calibration.nameless:
-        names = ", ".join(inputs.calibration.nameless[:3])
+    if inputs.calibration is not None and inputs.calibration.unknown_parameters:
+        names = ", ".join(inputs.calibration.unknown_parameters[:3])
         warnings.append(f"covariance in {mission.calibration} of what it does not have, passed over: {names}")
     if mission.vertical_datum is not None and mission.tide is None and mission.navigation is not None:
         warnings.append(

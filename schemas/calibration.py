@@ -174,7 +174,7 @@ class Calibration(Model):
     covariance: tuple[CovarianceBlock, ...] = ()
 
     @property
-    def nameless(self) -> list[str]:
+    def unknown_parameters(self) -> list[str]:
         """Parameters of the covariance blocks that the file does not have."""
         known = {f"camera.{name}" for name in ("fx", "fy", "cx", "cy")}
         known |= {f"camera.distortion.{name}" for name in DISTORTION[self.camera.model]}

@@ -48,25 +48,19 @@ class Ranges(NamedTuple):
         return Ranges(*(column[keep] for column in self))
 
 
-def slopes(X: Array) -> Array:
-    """Rise of the seabed to the east and north (N, 2) at points X (N, 3), by the plane of their neighbours."""
-    return _slopes(X, _neighbours(X)[1]) if len(X) > _NEIGHBOURS else np.zeros((len(X), 2))
+def slopes(X: Array, tree: KDTree) -> tuple[Array, Array]:
+    """The seabed at points X (N, 3), more than 12 and in a tree of their x and y, by the plane of their neighbours.
 
-
-def _slopes(X: Array, nearest: Indices) -> Array:
+    Its rise to the east and north (N, 2), and how far the farthest of these neighbours is (N,).
+    """
+    distance, nearest = (np.asarray(found) for found in tree.query(X[:, :2], k=_NEIGHBOURS))
     around = X[nearest] - X[nearest].mean(1, keepdims=True)
     xy, z = around[:, :, :2], around[:, :, 2]
     normal = np.einsum("nki,nkj->nij", xy, xy)
     # as if one more neighbour stood level at the same distance: few in a row do not tell the slope across it
     normal += np.eye(2) * np.trace(normal, axis1=1, axis2=2)[:, None, None] / (2 * _NEIGHBOURS) + 1e-12 * np.eye(2)
     found = np.linalg.solve(normal, np.einsum("nki,nk->ni", xy, z)[..., None])[..., 0]
-    return np.clip(found, -_STEEPEST, _STEEPEST)
-
-
-def _neighbours(X: Array, tree: KDTree | None = None) -> tuple[Array, Indices]:
-    """Distance to the farthest of the nearest points (N,), and which these are (N, 12). tree : of their x and y."""
-    distance, nearest = (tree or KDTree(X[:, :2])).query(X[:, :2], k=_NEIGHBOURS)
-    return np.asarray(distance)[:, -1], np.asarray(nearest)
+    return np.clip(found, -_STEEPEST, _STEEPEST), distance[:, -1]
 
 
 def measure(poses: Poses, X: Array, soundings: Mapping[int, Array], most: int) -> Ranges:
@@ -78,8 +72,7 @@ def measure(poses: Poses, X: Array, soundings: Mapping[int, Array], most: int) -
     found = [(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0), np.zeros(0), np.zeros((0, 2)))]
     if len(X) > _NEIGHBOURS:
         tree = KDTree(X[:, :2])
-        width, nearest = _neighbours(X, tree)
-        slope = _slopes(X, nearest)
+        slope, width = slopes(X, tree)
         for k, own in soundings.items():
             if len(own) and np.isfinite(poses.C_local[k]).all():
                 track, range_m, away_m = _of_image(poses, k, own, X, slope, tree, most, width)

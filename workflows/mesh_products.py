@@ -24,13 +24,13 @@ def write(results: Results, folder: Path, crs_wkt: str) -> MeshQuality:
     pyramid, mapped = results.mapped.mesh, results.mapped
     west, _, _, north = mapped.ground.grid.bounds
     origin = np.array([west, north, 0.0])
-    about = {"crs": crs_wkt, "offset": origin.tolist(), "axes": "x east, y up, z south"}
+    about = {"crs": crs_wkt, "offset": origin.tolist()}
     _write_tiles(results, folder / _FOLDER, None if results.opened.crs is None else crs_wkt, origin, about)
     level = level_of_file(pyramid, results.job.parameters.mesh.max_triangles)
     chosen = {place: done for place, done in pyramid.items() if place.level == level and done.info["triangles"]}
     shrink = _shrink(list(chosen.values()), results.job.parameters.mesh.texture_px)
     parts = [_part(results, place, done, origin, shrink) for place, done in chosen.items()]
-    meshes.write_glb(folder / "mesh.glb", parts, about)
+    meshes.write_glb(folder / "mesh.glb", parts, about | {"axes": "x east, y up, z south"})
     vertices, triangles, colours = _joined(results, chosen, parts)
     comments = [f"offset {west:.6f} {north:.6f} 0.000000", f"crs {crs_wkt}"]
     meshes.write_ply(folder / "mesh.ply", vertices, triangles, colours, comments=comments)

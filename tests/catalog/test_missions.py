@@ -11,53 +11,12 @@ import pyproj
 import pytest
 import xarray
 from PIL import Image
-from seamosaic.catalog.missions import OpenedMission, open_mission
-from seamosaic.schemas.problems import InvalidInput, Problem
+from seamosaic.catalog.missions import open_mission
+
+from tests.catalog.edited import copy, edit, images, problem, problems, status, truncate, without_navigation
 
 NAVIGATION = ("longitude", "latitude", "elevation", "altitude", "roll", "pitch", "heading")
 SIGMAS = ("sigma_horizontal", "sigma_depth", "sigma_roll", "sigma_pitch", "sigma_heading")
-
-
-def edit(path: Path, *changes: tuple[str, str]) -> None:
-    text = path.read_text()
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    path.write_text(text)
-
-
-def images(mission: Path) -> list[Path]:
-    return sorted((mission / "images").iterdir())
-
-
-def truncate(path: Path) -> None:
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
-
-
-def problems(mission: Path | str, **options) -> list[Problem]:
-    with pytest.raises(InvalidInput) as caught:
-        open_mission(str(mission), **options)
-    assert all(p.file and p.found and p.expected and p.remedy for p in caught.value.problems)
-    return list(caught.value.problems)
-
-
-def problem(mission: Path | str) -> Problem:
-    (found,) = problems(mission)
-    return found
-
-
-def status(opened: OpenedMission) -> dict[str, str]:
-    return {
-        Path(str(name)).name: str(text)
-        for name, text in zip(opened.frames["image"].values, opened.frames["status"].values, strict=True)
-        if text
-    }
-
-
-def without_navigation(mission: Path) -> None:
-    path = mission / "mission.yaml"
-    path.write_text(path.read_text().split("navigation:")[0])
 
 
 # --- a good mission ---
@@ -264,10 +223,6 @@ def _wrong_size(path: Path) -> None:
     assert cv2.imwrite(str(path), np.zeros((48, 32, 3), np.uint8))
 
 
-def _copy(path: Path) -> None:
-    shutil.copy(path, path.with_name(path.stem + "_copy.jpg"))
-
-
 @pytest.mark.parametrize(
     ("spoil", "name", "reason"),
     [
@@ -276,7 +231,7 @@ def _copy(path: Path) -> None:
         (lambda p: p.write_bytes(b"not"), "V_20260603T021413.136751Z.jpg", "rejected: not a JPEG, PNG or TIFF image"),
         (_wrong_size, "V_20260603T021413.136751Z.jpg", "rejected: size 32x48, calibration says 64x48"),
         (
-            _copy,
+            copy,
             "V_20260603T021413.136751Z_copy.jpg",
             "rejected: duplicate timestamp of images/V_20260603T021413.136751Z.jpg",
         ),
@@ -303,7 +258,7 @@ def test_a_bad_image_is_recorded(tiny_mission: Path, spoil: Callable[[Path], obj
 
 def test_a_duplicate_of_a_rejected_image_is_kept(tiny_mission: Path) -> None:
     path = images(tiny_mission)[3]
-    _copy(path)
+    copy(path)
     truncate(path)
     assert set(status(open_mission(str(tiny_mission)))) == {path.name}
 
@@ -330,163 +285,6 @@ def test_examples_are_few(tiny_mission: Path) -> None:
     for path in images(tiny_mission):
         truncate(path)
     assert problem(tiny_mission).found.endswith("and 7 more")
-
-
-# --- wrong missions: everything at once, no traceback ---
-
-
-def test_navigation_that_does_not_cover_the_images(tiny_mission: Path) -> None:
-    edit(tiny_mission / "mission.yaml", ("path: navigation.csv", "path: navigation.csv\n  time_offset: 3600"))
-    found = problem(tiny_mission)
-    assert found.key == "navigation"
-    assert "navigation from 2026-06-03T03:14:08.636751Z" in found.found
-    assert "images from 2026-06-03T02:14:10.136751Z" in found.found
-    assert "time_offset" in found.remedy
-
-
-def test_navigation_that_covers_half_of_the_images(tiny_mission: Path) -> None:
-    path = tiny_mission / "navigation.csv"
-    path.write_text("\n".join(path.read_text().splitlines()[:15]))
-    found = problem(tiny_mission)
-    assert "4 of 10 images rejected" in found.found
-    assert "outside the navigation" in found.found
-
-
-@pytest.mark.parametrize("name", ["mission.yaml", "calibration.yaml", "navigation.csv"])
-def test_a_missing_file(tiny_mission: Path, name: str) -> None:
-    (tiny_mission / name).unlink()
-    found = problem(tiny_mission)
-    assert found.file == "mission.yaml"
-    assert f"no file {name}" in found.found
-    lines = {"mission.yaml": None, "calibration.yaml": 7, "navigation.csv": 9}
-    assert found.line == lines[name]
-
-
-def test_all_files_missing_are_named(tiny_mission: Path) -> None:
-    (tiny_mission / "calibration.yaml").unlink()
-    (tiny_mission / "navigation.csv").unlink()
-    shutil.rmtree(tiny_mission / "images")
-    assert {p.key for p in problems(tiny_mission)} == {"calibration", "navigation.path", "images.0.path"}
-
-
-@pytest.mark.parametrize(
-    ("url", "found"),
-    [
-        ("{}/nowhere", "nothing"),
-        ("{}/tiny/mission.yaml", "a file"),
-        ("nosuch://bucket/x", "no access"),
-        ("memory://nowhere", "nothing"),
-    ],
-)
-def test_a_wrong_place(tiny_mission: Path, url: str, found: str) -> None:
-    assert problem(url.format(tiny_mission.parent)).found.startswith(found)
-
-
-def test_duplicate_times_in_the_navigation(tiny_mission: Path) -> None:
-    path = tiny_mission / "navigation.csv"
-    rows = path.read_text().splitlines()
-    path.write_text("\n".join([*rows[:6], rows[5], *rows[6:]]))
-    found = problem(tiny_mission)
-    assert (found.file, found.line, found.key) == ("navigation.csv", 7, "time")
-    assert "the time of line 6" in found.found
-
-
-def test_duplicate_times_of_the_images(tiny_mission: Path) -> None:
-    for path in images(tiny_mission)[:4]:
-        _copy(path)
-    found = problem(tiny_mission)
-    assert "4 of 14 images rejected" in found.found
-    assert "duplicate timestamp of" in found.found
-
-
-def test_nan_cells(tiny_mission: Path) -> None:
-    edit(tiny_mission / "navigation.csv", ("6.0127,12.000", "nan,12.000"), ("12.010,3.1", "12.010,inf"))
-    assert [(p.file, p.line, p.key, p.found) for p in problems(tiny_mission)] == [
-        ("navigation.csv", 5, "longitude", "'nan'"),
-        ("navigation.csv", 6, "altitude", "'inf'"),
-    ]
-
-
-def test_everything_wrong_is_said_at_once(tiny_mission: Path) -> None:
-    edit(tiny_mission / "mission.yaml", ("title:", "titel:"), ("calibration:", "crs: EPSG:4326\ncalibration:"))
-    edit(tiny_mission / "calibration.yaml", ("fx: 80.0", "fx: -80.0"))
-    edit(tiny_mission / "navigation.csv", ("6.0127,12.000", "NaN,12.000"))
-    truncate(images(tiny_mission)[2])
-    _copy(images(tiny_mission)[4])
-    found = problems(tiny_mission)
-    assert [(p.file, p.line, p.key) for p in found] == [
-        ("mission.yaml", 3, "titel"),
-        ("calibration.yaml", 6, "camera.fx"),
-        ("navigation.csv", 5, "longitude"),
-        ("mission.yaml", 7, "crs"),
-        ("images", None, ""),
-        ("images", None, ""),
-    ]
-    assert "truncated" in found[4].found
-    assert "duplicate" in found[5].found
-
-
-@pytest.mark.parametrize("text", ["format: 1\n  id: x: y\n", "", "- 1\n", "\xff"])
-def test_a_useless_mission_file_does_not_hide_the_others(tiny_mission: Path, text: str) -> None:
-    (tiny_mission / "mission.yaml").write_text(text, encoding="latin-1")
-    edit(tiny_mission / "calibration.yaml", ("fx: 80.0", "fx: -80.0"))
-    edit(tiny_mission / "navigation.csv", ("6.0127,12.000", "NaN,12.000"))
-    assert [p.file for p in problems(tiny_mission)] == ["mission.yaml", "calibration.yaml", "navigation.csv"]
-
-
-def test_a_pattern_without_images(tiny_mission: Path) -> None:
-    edit(tiny_mission / "mission.yaml", ("*.jpg", "*.JPG"))
-    assert "case-sensitive" in problem(tiny_mission).remedy
-    edit(tiny_mission / "mission.yaml", ("*.JPG", "*.png"))
-    found = problem(tiny_mission)
-    assert (found.line, found.key) == (5, "images.0.path")
-    assert "V_20260603T021410.136751Z.jpg" in found.remedy
-    edit(tiny_mission / "mission.yaml", ("images/*.png", "pictures/*.png"))
-    assert "no file in that folder" in problem(tiny_mission).remedy
-
-
-def test_patterns(tiny_mission: Path) -> None:
-    (tiny_mission / "images" / "deep" / "er").mkdir(parents=True)
-    for i, path in enumerate(images(tiny_mission)[:4]):
-        path.rename(tiny_mission / "images" / "deep" / ("er" if i % 2 else "") / path.name)
-    (tiny_mission / "images" / "._V_20260603T021414.136751Z.jpg").write_bytes(b"what a Mac leaves behind")
-    for pattern, count in (("*", 6), ("**/*", 10), ("*/*", 2), ("deep/**/*", 4), ("V_*[5-9].136751Z", 5)):
-        text = (tiny_mission / "mission.yaml").read_text()
-        (tiny_mission / "mission.yaml").write_text(text.replace("'images/*.jpg'", f"'images/{pattern}.jpg'"))
-        assert open_mission(str(tiny_mission), hashed=False).frames.sizes["image"] == count
-        (tiny_mission / "mission.yaml").write_text(text)
-
-
-def test_an_image_in_two_sets(tiny_mission: Path) -> None:
-    line = "  - {path: 'images/*.jpg', role: combined}\n"
-    edit(tiny_mission / "mission.yaml", (line, line + "  - {path: 'images/V_*1?.*.jpg', role: texture}\n"))
-    found = problem(tiny_mission)
-    assert (found.line, found.key) == (6, "images.1.path")
-    assert "'images/*.jpg' matches too" in found.found
-
-
-@pytest.mark.parametrize("role", ["combined", "laser"])
-def test_laser_images_need_a_laser(tiny_mission: Path, role: str) -> None:
-    path = tiny_mission / "calibration.yaml"
-    path.write_text(path.read_text().split("laser:")[0])
-    edit(tiny_mission / "mission.yaml", ("combined", role))
-    found = problem(tiny_mission)
-    assert (found.line, found.key, found.expected) == (5, "images.0.role", "a laser in calibration.yaml")
-    edit(tiny_mission / "mission.yaml", (role, "texture"))
-    assert open_mission(str(tiny_mission)).warnings == []
-    without_navigation(tiny_mission)
-    assert "scale" in open_mission(str(tiny_mission)).warnings[0]
-
-
-def test_a_wrong_laser_is_not_called_missing(tiny_mission: Path) -> None:
-    edit(tiny_mission / "calibration.yaml", ("angle: 25", "angle: 95"))
-    assert problem(tiny_mission).key == "laser.planes.angle"
-
-
-def test_laser_images_alone_need_navigation(tiny_mission: Path) -> None:
-    edit(tiny_mission / "mission.yaml", ("combined", "laser"))
-    without_navigation(tiny_mission)
-    assert problem(tiny_mission).key == "navigation"
 
 
 def test_gaps_and_missing_altitudes_are_worth_a_word(tiny_mission: Path) -> None:

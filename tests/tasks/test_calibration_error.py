@@ -85,4 +85,4 @@ def test_a_covariance_of_what_is_not_there_says_nothing():
     other = block(["laser.planes.left.offset", "camera.k1"], np.eye(2))
     assert common_error(true.camera, true.laser, [other]) is None
     named = true.model_copy(update={"covariance": (other, block(["laser.planes.a.offset", *CAMERA], np.eye(6)))})
-    assert named.nameless == ["laser.planes.left.offset", "camera.k1"]
+    assert named.unknown_parameters == ["laser.planes.left.offset", "camera.k1"]

@@ -1,4 +1,5 @@
 import numpy as np
+from scipy.spatial import KDTree
 from seamosaic.tasks import laser_ranges
 
 from tests.tasks import scenes
@@ -46,13 +47,15 @@ def test_the_nearest_are_taken_first_and_images_without_laser_tell_nothing():
     assert not len(laser_ranges.measure(poses, X, {}, 10).track)
     assert not len(laser_ranges.measure(poses, X + [40, 0, 0], soundings, 10).track)  # an image on its own
     assert not len(laser_ranges.measure(poses, X[:0], soundings, 10).track)
+    assert not len(laser_ranges.measure(poses, X[:12], soundings, 10).track)
 
 
 def test_slopes_of_a_plane():
     rng = np.random.default_rng(0)
     xy = rng.uniform(-2, 2, (400, 2))
     X = np.column_stack([xy, 0.2 * xy[:, 0] - 0.1 * xy[:, 1]])
-    found = laser_ranges.slopes(X)
+    found, width = laser_ranges.slopes(X, KDTree(xy))
     assert np.abs(np.median(found, axis=0) - [0.2, -0.1]).max() < 0.03
     assert (np.abs(np.median(found, axis=0)) < [0.2, 0.1]).all()  # drawn a little towards level
-    assert (laser_ranges.slopes(X[:5]) == 0).all()
+    nearest = np.sort(np.linalg.norm(xy - xy[0], axis=1))
+    assert width[0] == nearest[11]
