@@ -6,6 +6,7 @@ image. Pair motions enter as relative poses with their covariance under a robust
 image is the datum and the motions are chained from it (paper IV). `tasks.bundle` takes it from here.
 """
 
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import gtsam
@@ -116,6 +117,24 @@ def adjust(
     )
 
 
+def tells_anew(links: list[Link], poses: Poses, status: Sequence[str], navigation: NavigationPrior) -> bool:
+    """Whether links that came after the adjustment would change it.
+
+    They would where they join an image that only navigation places, or where two of an image contradict its pose: one
+    alone is rather a wrong match, for what lies elsewhere overlaps several images there.
+
+    poses, status : of the adjustment.
+    """
+    adjusted = navigation._replace(poses=poses)
+    contradicting = np.zeros(len(status), int)
+    for link in links:
+        if "navigation" in (status[link.i], status[link.j]):
+            return True
+        between = _placed(poses, link.i).between(_placed(poses, link.j))
+        contradicting[[link.i, link.j]] += not _consistent(_scaled_by_navigation(link, adjusted).motion, between)
+    return bool((contradicting > 1).any())
+
+
 def _half_turns(count: int, links: list[Link]) -> NDArray[np.bool_]:
     """Images (n,) of which most matches say that they lie the other way round than navigation has them."""
     votes = np.zeros(count)
@@ -217,8 +236,15 @@ def _solve(graph: Any, links: list[Link], start: Poses, threshold: float) -> Any
 
 def _agrees(link: Link, values: Any) -> bool:
     """Whether the solution is within six sigma of a link's motion."""
-    between = values.atPose3(link.i).between(values.atPose3(link.j))
-    return _distance(link.motion, between, link.motion.covariance + _LINK_FLOOR) < 6
+    return _consistent(link.motion, values.atPose3(link.i).between(values.atPose3(link.j)))
+
+
+def _placed(poses: Poses, k: int) -> Any:
+    return pose(poses.R_local_camera[k], poses.C_local[k])
+
+
+def _consistent(motion: Motion, between: Any) -> bool:
+    return _distance(motion, between, motion.covariance + _LINK_FLOOR) < 6
 
 
 def sigmas(covariances: Array, poses: Poses, navigation: NavigationPrior | None) -> tuple[Array, Array, Array]:

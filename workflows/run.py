@@ -260,8 +260,8 @@ def _close_loops(
 ) -> list[tuple[int, int, Done]]:
     """Match what overlaps by the poses so far and adjust again, until nothing new overlaps.
 
-    With navigation that is nothing, unless the poses contradict it, and then once. All matches; the adjustments are
-    added to those given.
+    With navigation that is nothing, unless the poses contradict it, and then once, and adjusted only if that tells
+    anything new. All matches; the adjustments are added to those given.
     """
     job, made = state.job, state.plan
     extracted = _by_row(made, extracts)
@@ -273,12 +273,15 @@ def _close_loops(
         wanted = more(made, state.opened, job.parameters, poses, ranges, known)
         if not wanted:
             break
-        prior = plan.adjusted_prior(made, poses)
-        tasks = _match_tasks(state, wanted, prior, extracts, batch_of, f"match-{turn}")
+        tasks = _match_tasks(state, wanted, plan.adjusted_prior(made, poses), extracts, batch_of, f"match-{turn}")
         again = [pair for part in compute(state, "loops", tasks) for pair in part]
         tried = {(i, j) for i, j, _ in again}
         known += tried
         matched = [pair for pair in matched if pair[:2] not in tried] + again
+        linked = sum(bool(done.info["model"]) for _, _, done in again)
+        log.info("mission=%s step=%s later_pairs=%d linked=%d", job.mission_id, match.STEP, len(again), linked)
+        if made.prior is not None and not solve.tells_anew(job, adjustments[-1], again, made.prior):
+            break
         adjustments += compute(state, "adjust", [_adjust_task(state, [matched], extracts, f"adjust-{turn}")])
     return matched
 

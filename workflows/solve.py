@@ -9,7 +9,7 @@ import numpy as np
 
 from ..catalog.store import Store
 from ..tasks import adjust, bundle, crossovers, tracks
-from ..tasks.adjust import Adjusted
+from ..tasks.adjust import Adjusted, Link
 from ..tasks.navigation import NavigationPrior, Poses
 from ..tasks.residuals import Residuals
 from . import extract, match
@@ -85,8 +85,18 @@ def adjust_all(
 def _chained(
     job: Job, count: int, linked: Sequence[tuple[int, int, Done]], prior: NavigationPrior | None, R_first: np.ndarray
 ) -> Adjusted:
-    links = [match.link(i, j, load(job, match.STEP, done.key)) for i, j, done in linked]
-    return adjust.adjust(count, links, prior, R_first, job.parameters.adjust)
+    return adjust.adjust(count, _links(job, linked), prior, R_first, job.parameters.adjust)
+
+
+def _links(job: Job, linked: Sequence[tuple[int, int, Done]]) -> list[Link]:
+    return [match.link(i, j, load(job, match.STEP, done.key)) for i, j, done in linked]
+
+
+def tells_anew(job: Job, made: Done, later: Sequence[tuple[int, int, Done]], prior: NavigationPrior) -> bool:
+    """Whether pairs matched after an adjustment would change it; see `tasks.adjust.tells_anew`."""
+    found = solution(job, made.key)
+    links = _links(job, [pair for pair in later if pair[2].info["model"]])
+    return adjust.tells_anew(links, found.poses, found.status, prior)
 
 
 def _bundle(
