@@ -23,6 +23,7 @@ FOLDER: Final = ".leases"
 TERM_S: Final = 120.0
 _BEATS_A_TERM: Final = 5
 _ASK_AGAIN_S: Final = 0.2
+_TAKEN: Final[set["Lease"]] = set()  # by this process, and not given back
 
 
 class Holder(NamedTuple):
@@ -78,10 +79,16 @@ class Lease:
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
-        self._thread.join()
+        self._thread.join()  # else it may be writing
+        self.give_back()
+
+    def give_back(self) -> None:
+        """Remove its file, if no other took it meanwhile."""
+        self._ended.set()
         with suppress(OSError):  # what cannot be given back lapses
             if self.is_ours():
                 json_files.remove(self.url)
+        _TAKEN.discard(self)
 
     def _beat(self) -> None:
         term, renewed = self.holder.term_s, time.monotonic()
@@ -134,17 +141,23 @@ def _take(folder: str, purpose: str, term_s: float, shared: bool) -> Lease:
     number = max((number for number, _ in present), default=0) + 1
     url = f"{folder}/{number}.json"
     lease = Lease(url, ours)
+    _TAKEN.add(lease)
     try:
         json_files.write_json(url, ours._asdict(), new=True)
         _confirm(lease, folder, shared)
     except FileExistsError:
+        _TAKEN.discard(lease)
         raise Busy(_read(url)) from None
-    except BaseException:  # also a signal that comes in between
-        with suppress(OSError):
-            if lease.is_ours():
-                json_files.remove(url)
+    except BaseException:
+        lease.give_back()
         raise
     return lease
+
+
+def give_back_all() -> None:
+    """Give back what this process has taken, before it ends: a signal may come before a lease is entered."""
+    for lease in tuple(_TAKEN):
+        lease.give_back()
 
 
 def _confirm(lease: Lease, folder: str, shared: bool) -> None:

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ..catalog import leases
 from ..schemas.problems import InvalidInput, Problem
 from . import archive_commands, options
 from .calibrate_commands import app as calibrate_app
@@ -233,6 +234,8 @@ def main() -> None:
         log.debug("failed", exc_info=True)
         _say(f"failed: {str(error) or type(error).__name__}{_remedy(error)}")
         sys.exit(FAILED)
+    finally:
+        leases.give_back_all()
 
 
 def _remedy(error: Exception) -> str:

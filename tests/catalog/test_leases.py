@@ -1,5 +1,6 @@
 """Leases: one holder at a time, renewed while it lives, free when it died, nothing left behind."""
 
+import itertools
 import os
 import signal
 import subprocess
@@ -134,3 +135,44 @@ def test_pruning_is_waited_for(tmp_path, shared):
     threading.Timer(0.5, json_files.remove, [pruning.url]).start()
     lease = leases.take(str(tmp_path), "reef", shared=shared)
     assert lease.holder.since >= pruning.holder.since + 0.4
+
+
+def test_what_a_signal_interrupts_before_it_is_entered_is_given_back(out):
+    leases.take(out, "reef")
+    with leases.take(out, "sea") as kept:
+        leases.give_back_all()
+        assert leases.holder(out, "reef") is None
+        assert leases.holder(out, "sea") is None
+    assert not kept.lost.is_set()
+
+
+def test_a_signal_at_any_line_leaves_no_lease(tmp_path):
+    """While it is taken, held and given back; what was entered is given back by itself, the rest at the end."""
+    before = sys.gettrace()
+    for line in itertools.count(1):
+        out, left = str(tmp_path / str(line)), [line]
+
+        def count(frame, event, _, left=left):
+            if frame.f_code.co_filename != leases.__file__:
+                return None
+            left[0] -= event == "line"
+            if left[0] == 0:
+                left[0] = -1
+                raise SystemExit
+            return count
+
+        try:
+            sys.settrace(count)
+            with leases.take(out, "reef"):
+                pass
+            done = left[0] > 0
+        except SystemExit:
+            done = False
+        finally:
+            sys.settrace(before)
+        leases.give_back_all()
+        assert leases.holder(out, "reef") is None, line
+        assert not list(tmp_path.rglob("*.json"))
+        if done:
+            break
+    assert line > 50

@@ -189,3 +189,21 @@ def test_a_jump_of_navigation_does_not_tear_the_map():
     held = _run(poses, [link._replace(free=link.j == link.i + 1) for link in links], navigation)
     assert _rigid_rms(torn.poses.C_local, poses.C_local) > 0.3
     assert 0.0005 < _rigid_rms(held.poses.C_local, poses.C_local) < 0.03
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_later_links_tell_anew_what_they_contradict_or_join(metric):
+    rng, poses = np.random.default_rng(9), _survey()
+    navigation, links = _navigation(poses, rng), _links(poses, rng, metric=metric)
+    later = links[5::6]
+    found = _run(poses, [link for link in links if link not in later], navigation)
+
+    def anew(links, poses=found.poses, status=found.status):
+        return adjust.tells_anew(links, poses, status, navigation)
+
+    assert not anew(later)
+    wrong = Link(3, 14, _motion(np.eye(3), np.array([0.4, 0.4, 0.0]) / (1 if metric else 0.566), metric))
+    assert not anew([*later, wrong])
+    moved = found.poses._replace(C_local=found.poses.C_local + np.where(np.arange(24) < 12, 0.0, 0.5)[:, None])
+    assert anew(links, moved)
+    assert anew(later, status=["navigation" if k == later[0].i else one for k, one in enumerate(found.status)])
