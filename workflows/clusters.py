@@ -13,6 +13,14 @@ from ..schemas.problems import InvalidInput, Problem
 from .heap import WORKER_ENVIRONMENT
 
 _FREE_PORT = ":0"
+# How often scheduler, nannies and workers of this machine look at themselves: at Dask's own intervals, of 10 to 500 ms,
+# that took a twentieth of a core
+_SETTINGS = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.worker.memory.monitor-interval": "500ms",
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "2s",
+}
 _STARTS = 5
 
 
@@ -50,6 +58,7 @@ def local(workers: int | None) -> Cluster:
 
 
 def _local(described: Cluster) -> LocalCluster:
+    dask.config.set(_SETTINGS)
     environment = "distributed.nanny.pre-spawn-environ"
     dask.config.set({f"{environment}.{name}": value for name, value in WORKER_ENVIRONMENT.items()})
     options: dict[str, Any] = {
