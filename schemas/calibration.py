@@ -9,7 +9,7 @@ from .base import Model
 from .problems import inconsistent
 
 Vector = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
+_LEAST_ROLL = 0.01  # degrees from a plus, of which a row of the image crosses one arm nowhere or everywhere
 
 
 class Port(Model):
@@ -84,6 +84,17 @@ class CrossGeometry(Model):
     angle: Annotated[float, Field(gt=0, lt=90, description="alpha, degrees from the camera axis")]
     roll: Annotated[float, Field(ge=-180, le=180, description="degrees; 45 in the paper")] = 45.0
 
+    @model_validator(mode="after")
+    def _a_cross(self) -> "CrossGeometry":
+        if abs(math.remainder(self.roll, 90.0)) < _LEAST_ROLL:
+            raise inconsistent(
+                "roll",
+                f"{self.roll:g} degrees, a plus along rows and columns of the image",
+                "one rising and one falling arm (a cross, paper III.A)",
+                "Give the roll of the cross, about 45 degrees.",
+            )
+        return self
+
 
 def _how_given(planes: object) -> str | None:
     """Which of the two ways of giving the sheets is meant, so that an error speaks of that one only."""
@@ -111,6 +122,9 @@ class Laser(Model):
 
     @model_validator(mode="after")
     def _two_directions(self) -> "Laser":
+        if self.sheets[0].name == self.sheets[1].name:
+            remedy = "Give each sheet a name of its own, as a and b."
+            raise inconsistent("planes", f"two sheets named {self.sheets[0].name}", "two names", remedy)
         slopes = [-plane.normal[0] / plane.normal[1] for plane in self.sheets]
         if slopes[0] * slopes[1] >= 0:
             raise inconsistent(
@@ -157,6 +171,22 @@ class CovarianceBlock(Model):
         if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
             remedy = "Give one row and one column a parameter."
             raise inconsistent("matrix", f"{len(self.matrix)} rows", f"{size} x {size} numbers", remedy)
+        return self
+
+    @model_validator(mode="after")
+    def _covariance(self) -> "CovarianceBlock":
+        if len(set(self.parameters)) < len(self.parameters):
+            raise inconsistent(
+                "parameters", "a parameter twice", "each once", "Give one row and one column a parameter."
+            )
+        for k, (name, row) in enumerate(zip(self.parameters, self.matrix, strict=True)):
+            if row[k] < 0:
+                raise inconsistent("matrix", f"{row[k]:g} as variance of {name}", "0 or more", "Correct the diagonal.")
+            for j, value in enumerate(row[:k]):
+                other, most = self.matrix[j][k], 1e-6 * math.sqrt(row[k] * self.matrix[j][j])
+                if abs(value - other) > max(most, 1e-6 * abs(value)):
+                    expected = f"{other:g}, as in row {j + 1}"
+                    raise inconsistent("matrix", f"{value:g} in row {k + 1}", expected, "Make the matrix symmetric.")
         return self
 
 

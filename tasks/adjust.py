@@ -36,6 +36,7 @@ Array = NDArray[Any]
 Status = Literal["adjusted", "navigation", "rejected: no link to the placed images"]
 
 _TURN = np.radians(2.0)
+_FEW = 1 / 500  # of all images: for so few that pairs found later would join, not all are adjusted again
 # what calibration and the pinhole leave in a pair motion, whatever its matches say: 0.01 degree and 1 mm
 _LINK_FLOOR = np.diag([np.radians(0.01)] * 3 + [1e-3] * 3) ** 2
 
@@ -120,19 +121,22 @@ def adjust(
 def tells_anew(links: list[Link], poses: Poses, status: Sequence[str], navigation: NavigationPrior) -> bool:
     """Whether links that came after the adjustment would change it.
 
-    They would where they join an image that only navigation places, or where two of an image contradict its pose: one
-    alone is rather a wrong match, for what lies elsewhere overlaps several images there.
+    They would where they join images that only navigation places, more than a few of them, or where most of an image's,
+    and two at least, contradict its pose: one alone is rather a wrong match, for what lies elsewhere overlaps several
+    images there.
 
     poses, status : of the adjustment.
     """
     adjusted = navigation._replace(poses=poses)
-    contradicting = np.zeros(len(status), int)
+    joined = {k for link in links for k in (link.i, link.j) if status[k] == "navigation"}
+    if len(joined) > _FEW * len(status):
+        return True
+    told, contradicting = np.zeros((2, len(status)), int)
     for link in links:
-        if "navigation" in (status[link.i], status[link.j]):
-            return True
         between = _placed(poses, link.i).between(_placed(poses, link.j))
+        told[[link.i, link.j]] += 1
         contradicting[[link.i, link.j]] += not _consistent(_scaled_by_navigation(link, adjusted).motion, between)
-    return bool((contradicting > 1).any())
+    return bool(((contradicting > 1) & (2 * contradicting > told)).any())
 
 
 def _half_turns(count: int, links: list[Link]) -> NDArray[np.bool_]:

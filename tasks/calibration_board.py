@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from ..schemas.calibration import Camera
+from ..schemas.calibration import DISTORTION, Camera
 from .board_shape import FLAT, Shape, around, heights, meet
-from .calibration_board_start import DISTORTION, first_poses, first_sheet
+from .calibration_board_start import first_poses, first_sheet
 from .calibration_sheets import SheetBasis, cast_rays, moved
 from .calibration_solve import Layout, Solved, solve, unit_sigma
 from .camera import project, rays

@@ -1,25 +1,19 @@
 """Where a calibration with a board begins: camera, poses and sheets, each on its own, and which points to use."""
 
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..schemas.calibration import Camera
+from ..schemas.calibration import DISTORTION, Camera
 from .calibration_sheets import SheetBasis, moved
 from .camera import rays
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Model = Literal["brown", "fisheye", "flat-port"]
-
-DISTORTION: Final = {
-    "brown": ("k1", "k2", "p1", "p2", "k3"),
-    "flat-port": ("k1", "k2", "p1", "p2", "k3"),
-    "fisheye": ("k1", "k2", "k3", "k4"),
-}
 
 
 def first_camera(

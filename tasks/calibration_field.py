@@ -143,7 +143,7 @@ class FieldResult(NamedTuple):
     crossing_m : (C,) height differences, metres. crossing_uv : (C, 2) pixels of the first line there.
     used : (C,) which were not outliers.
     sigma : of GROUPS, factors on what was stated. counts : observations of GROUPS.
-    x : everything, to go on from. solved : the last adjustment.
+    x : everything, to go on from.
     """
 
     sheets: Array

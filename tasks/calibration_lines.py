@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +21,19 @@ _MIN_POINTS = 30
 _POINTS_A_LINE = 60
 _CLIPPED = 250
 _PLATEAU_PX = 4
+
+
+class Area(NamedTuple):
+    """The inside of a convex polygon (M, 2), pixels, or, if `beside`, all but that."""
+
+    polygon: Array
+    beside: bool = False
+
+    def holds(self, uv: Array) -> NDArray[np.bool_]:
+        """Which points (N, 2) lie in it."""
+        shape = np.ascontiguousarray(self.polygon, np.float32).reshape(-1, 1, 2)
+        inside = [cv2.pointPolygonTest(shape, (float(u), float(v)), False) >= 0 for u, v in uv]
+        return np.array(inside, bool) != self.beside
 
 
 class Lines(NamedTuple):
@@ -79,15 +93,16 @@ def between_edges(image: NDArray[np.uint8], uv: Array) -> Array:
     green = image if image.ndim == 2 else image[..., 1]
     height, width = green.shape
     row = np.clip(np.round(uv[:, 1]).astype(int), 1, height - 2)
-    column, number = np.clip(np.round(uv[:, 0]).astype(int), 0, width - 1), np.arange(len(uv))
-    level = green[row[:, None] + np.arange(-1, 2)].mean(axis=1)
+    column = np.clip(np.round(uv[:, 0]).astype(int), 0, width - 1)
+    rows, line = np.unique(row, return_inverse=True)
+    level = green[rows[:, None] + np.arange(-1, 2)].mean(axis=1)
     below = level < _CLIPPED
-    left = np.maximum.accumulate(np.where(below, np.arange(width), -1), axis=1)[number, column]
-    right = np.minimum.accumulate(np.where(below, np.arange(width), width)[:, ::-1], axis=1)[number, width - 1 - column]
+    left = np.maximum.accumulate(np.where(below, np.arange(width), -1), axis=1)[line, column]
+    right = np.minimum.accumulate(np.where(below, np.arange(width), width)[:, ::-1], axis=1)[line, width - 1 - column]
     broad = np.flatnonzero((left >= 0) & (right < width) & (right - left > _PLATEAU_PX))
-    number, left, right = number[broad], left[broad], right[broad]
+    line, left, right = line[broad], left[broad], right[broad]
     inward = [
-        (_CLIPPED - level[number, at]) / (level[number, at + side] - level[number, at])
+        (_CLIPPED - level[line, at]) / (level[line, at + side] - level[line, at])
         for at, side in ((left, 1), (right, -1))
     ]
     moved = uv.copy()
@@ -101,7 +116,11 @@ def rising(sheet: LaserPlane) -> bool:
 
 
 def cross_on_flat(
-    image_bgr: NDArray[np.uint8], camera: Camera, sheets: tuple[LaserPlane, LaserPlane], parameters: LaserParameters
+    image_bgr: NDArray[np.uint8],
+    camera: Camera,
+    sheets: tuple[LaserPlane, LaserPlane],
+    parameters: LaserParameters,
+    area: Area | None = None,
 ) -> Lines:
     """The two lines of a cross on a flat surface.
 
@@ -110,21 +129,26 @@ def cross_on_flat(
 
     Parameters
     ----------
-    image_bgr : (H, W, 3) uint8.
+    image_bgr : (H, W, 3) uint8. area : where the surface is, which one line alone may meet; None: everywhere, and there
+        is nothing unless both do.
     """
     points = laser.detect(image_bgr, parameters)
+    if area is not None:
+        points = points.take(area.holds(points.uv))
     if len(points.uv) < _MIN_POINTS:
         return no_lines()
     x = normalised(camera, points.uv) * camera.fx
     found = [_line(x, down_right, np.random.default_rng(0)) for down_right in (True, False)]
     curves = [None if keep is None else _curve(x, keep) for keep in found]
-    first, second = curves
-    if first is None or second is None:
+    if area is None and None in curves:
         return no_lines()
     width = float(np.median(points.width_px))
-    apart = np.abs(first(x[:, 1]) - second(x[:, 1])) > max(_APART_WIDTHS * width, 8.0 * points.step_px)
+    across = [x[:, 0] - curve(x[:, 1]) for curve in curves if curve is not None]
+    apart = np.ptp(across, axis=0) > max(_APART_WIDTHS * width, 8.0 * points.step_px) if len(across) > 1 else True
     arm = np.full(len(x), -1, np.int8)
-    for curve, down_right in ((first, True), (second, False)):
+    for curve, down_right in zip(curves, (True, False), strict=True):
+        if curve is None:
+            continue
         off = np.abs(x[:, 0] - curve(x[:, 1]))
         near = off < _NEAR_PX
         spread = 1.4826 * float(np.median(off[near])) if near.any() else 0.0

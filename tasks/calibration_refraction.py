@@ -65,7 +65,8 @@ def pinhole_error(camera: Camera, laser: Laser, altitude_m: Array) -> PinholeErr
     seen = [[_seen(camera, wrong, sheet, float(a)) for a in altitude_m] for sheet in sheets]
     fitted, camera_only = np.zeros(len(altitude_m)), np.zeros(len(altitude_m))
     for sheet, views in zip(sheets, seen, strict=True):
-        refitted = fit_sheet(np.concatenate([on_floor for on_floor, _ in views if len(on_floor)]))
+        lit = [on_floor for on_floor, _ in views if len(on_floor)]
+        refitted = fit_sheet(np.concatenate(lit)) if lit else sheet
         for a, (on_floor, slopes) in enumerate(views):
             for result, used in ((fitted, refitted), (camera_only, sheet)):
                 X = cast_rays(np.zeros_like(slopes), slopes, used)

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from ..schemas.calibration import Camera, CovarianceBlock, LaserPlane
 from .camera import normalised, outline
-from .triangulation import intersect
 
 Array = NDArray[np.float64]
 
@@ -128,7 +127,7 @@ class Sensitivity(NamedTuple):
 
 
 def sensitivity(camera: Camera, sheets: Sequence[LaserPlane], altitude_m: Array) -> Sensitivity:
-    """Change of the altitude, the mean over both arms, with each number of both sheets."""
+    """Change of the altitude, the mean over the arms in view, with each number of both sheets; NaN where none is."""
     h, size = 1e-6, 4 * len(sheets)
     gradient = np.zeros((len(altitude_m), size))
     for s, plane in enumerate(sheets):
@@ -137,8 +136,10 @@ def sensitivity(camera: Camera, sheets: Sequence[LaserPlane], altitude_m: Array)
             step = h * np.eye(4)[k]
             for a, altitude in enumerate(altitude_m):
                 up, down = (altitude_error(camera, true, true + sign * step, float(altitude)) for sign in (1, -1))
-                gradient[a, 4 * s + k] = (up - down) / (2 * h) / len(sheets)
-    return Sensitivity(np.asarray(altitude_m, float), np.nan_to_num(gradient))
+                gradient[a, 4 * s + k] = (up - down) / (2 * h)
+    seen = np.isfinite(gradient).reshape(len(altitude_m), len(sheets), 4).all(2).sum(1)
+    mean = np.nan_to_num(gradient) / np.where(seen, seen, np.nan)[:, None]
+    return Sensitivity(np.asarray(altitude_m, float), mean)
 
 
 def angle_deg(a: Sequence[float], b: Sequence[float]) -> float:
@@ -146,8 +147,3 @@ def angle_deg(a: Sequence[float], b: Sequence[float]) -> float:
     a_, b_ = np.asarray(a, float), np.asarray(b, float)
     cross = np.linalg.norm(np.cross(a_, b_))
     return float(np.degrees(np.arctan2(cross, abs(a_ @ b_))))
-
-
-def triangulated(camera: Camera, sheet: LaserPlane, uv: Array) -> Array:
-    """Points (N, 3) of pixels on a sheet, camera frame, metres."""
-    return intersect(camera, sheet, uv)[0]

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from ..schemas.parameters import LaserParameters
 from . import corner_fit, laser
-from .calibration_lines import between_edges
+from .calibration_lines import Area, between_edges
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -17,6 +17,7 @@ Grey = NDArray[np.uint8]
 _NEAR_PX: Final = 3.0
 _MIN_POINTS: Final = 40
 _TRIALS: Final = 1500
+_VOTING: Final = 4000  # points that say which of the trials is best
 _SMOOTH_PX: Final = 1.5
 _DARK: Final = 20
 _CLEAR_PX: Final = 20.0
@@ -66,12 +67,12 @@ def corners(grey: Grey, board: Board) -> tuple[Array, Array] | None:
 
     Parameters
     ----------
-    grey : (H, W) uint8. Brightness is stretched first, since a laser's glare leaves the board in the dark.
+    grey : (H, W) uint8. For a chessboard brightness is stretched first, since a laser's glare leaves it in the dark.
     """
-    bright = max(float(np.percentile(grey, 85)), 1.0)
-    stretched = np.clip(grey.astype(np.float32) * (200 / bright), 0, 255).astype(np.uint8)
     if board.kind == "charuco":
         return _charuco(grey, board)
+    bright = max(float(np.percentile(grey, 85)), 1.0)
+    stretched = np.clip(grey.astype(np.float32) * (200 / bright), 0, 255).astype(np.uint8)
     size = board.columns, board.rows
     found = _chessboard(stretched, grey, size)
     if found is None:
@@ -147,26 +148,20 @@ def outline(corner_uv: Array, grow: float) -> Array:
     return hull.mean(0) + (1 + grow) * (hull - hull.mean(0))
 
 
-def inside(uv: Array, polygon: Array) -> NDArray[np.bool_]:
-    """Which points (N,) lie in a convex polygon (M, 2)."""
-    shape = np.ascontiguousarray(polygon, np.float32).reshape(-1, 1, 2)
-    return np.array([cv2.pointPolygonTest(shape, (float(u), float(v)), False) >= 0 for u, v in uv], bool)
-
-
-def parallel_lines(image_bgr: NDArray[np.uint8], allowed: Array | None, count: int, p: LaserParameters) -> Light:
+def parallel_lines(image_bgr: NDArray[np.uint8], area: Area, count: int, p: LaserParameters) -> Light:
     """Points of `count` lines that run from top to bottom without crossing, numbered from the left.
 
     Parameters
     ----------
     image_bgr : (H, W, 3) or (H, W) uint8.
-    allowed : polygon (M, 2) outside which the light lies, or None.
+    area : where the light lies.
 
     Returns
     -------
     Light, empty where another number of lines was found.
     """
     points = laser.detect(image_bgr, p)
-    keep = np.ones(len(points.uv), bool) if allowed is None else ~inside(points.uv, allowed)
+    keep = area.holds(points.uv)
     uv, sigma = points.uv[keep], points.sigma_px[keep]
     lines = straight_lines(uv, count)
     if len(lines) != count:
@@ -191,8 +186,10 @@ def straight_lines(uv: Array, count: int) -> list[NDArray[np.intp]]:
         if not far.any():
             break
         slope = d[far, 0] / d[far, 1]
-        near = np.abs(x[:, :1] - x[a[far], 0] - (x[:, 1:] - x[a[far], 1]) * slope) < _NEAR_PX
-        best = near[:, int(near.sum(0).argmax())]
+        some = x[:: max(1, len(x) // _VOTING)]
+        near = np.abs(some[:, :1] - x[a[far], 0] - (some[:, 1:] - x[a[far], 1]) * slope) < _NEAR_PX
+        most = int(near.sum(0).argmax())
+        best = np.abs(x[:, 0] - x[a[far][most], 0] - (x[:, 1] - x[a[far][most], 1]) * slope[most]) < _NEAR_PX
         if best.sum() < _MIN_POINTS:
             break
         own = _tightened(x, best)

@@ -73,6 +73,13 @@ class MapFrame:
         x, y = self._geographic_from_map.transform(longitude, latitude, direction="INVERSE")
         return np.column_stack([x, y, elevation])
 
+    def map_around(self, X_local: Array, near: Array) -> Array:
+        """Map points (N, 3) of local points (N, 3) within tens of metres of one (3,): quick, good to a micrometre."""
+        if self.crs is None or not len(X_local):
+            return np.array(X_local, float)
+        local = self.affine_at(self.map_from_local(near[None])[0])
+        return (X_local - local.offset) @ np.linalg.inv(local.matrix).T
+
     def local_from_map(self, X_map: Array) -> Array:
         """Local points (N, 3) of map points (N, 3)."""
         X_map = np.asarray(X_map, float)

@@ -275,34 +275,38 @@ def _tones(
     """Gain and veil at the nodes of each image that counts, evened out with its neighbours'."""
     if tone is None:
         return [(None, None)] * len(views)
-    even = _thumbnails_blended(place, views, best, feather_m)
+    even, thumbnails = _thumbnails_blended(place, views, best, feather_m)
     result: list[tuple[Array32 | None, Array32 | None]] = []
-    for (shot, seen), parts in zip(views, patches, strict=True):
+    for (_, seen), parts, thumbnail in zip(views, patches, thumbnails, strict=True):
         if not parts:
             result.append((None, None))
             continue
         gain, veil = tone(seen.u, seen.v, seen.range_m)
-        if shot.thumbnail is not None:
-            own = np.maximum(small_at(shot.thumbnail, shot.camera, seen.u, seen.v), _DARKEST)
+        if thumbnail is not None:
+            own = np.maximum(thumbnail, np.float32(_DARKEST))
             ratio = np.clip(even[_part(place, seen)] / own, 1 / _MOST_EVENED, _MOST_EVENED).astype(np.float32)
             gain, veil = gain * ratio, veil * ratio
         result.append((np.nan_to_num(gain), np.nan_to_num(veil)))
     return result
 
 
-def _thumbnails_blended(place: Ground, views: Sequence[tuple[Shot, Seen]], best: Array32, feather_m: float) -> Array32:
-    """Colours (rows, columns, 3) of the thumbnails at the nodes, blended over wide seams."""
+def _thumbnails_blended(
+    place: Ground, views: Sequence[tuple[Shot, Seen]], best: Array32, feather_m: float
+) -> tuple[Array32, list[Array32 | None]]:
+    """Colours (rows, columns, 3) of the thumbnails at the nodes, blended over wide seams; and those of each view."""
+    own: list[Array32 | None] = []
     total, weights = np.zeros((*place.nodes.shape, 3), np.float32), np.zeros(place.nodes.shape, np.float32)
     for shot, seen in views:
-        if shot.thumbnail is None:
+        own.append(None if shot.thumbnail is None else small_at(shot.thumbnail, shot.camera, seen.u, seen.v))
+        if own[-1] is None:
             continue
         at = _part(place, seen)
         with np.errstate(invalid="ignore", over="ignore"):
             weight = np.exp(-np.maximum(seen.cost - best[at], 0) / (_WIDE_FEATHERS * feather_m)) * _from_rim(shot, seen)
         weight = np.nan_to_num(weight).astype(np.float32) + np.float32(1e-12)
-        total[at] += small_at(shot.thumbnail, shot.camera, seen.u, seen.v) * weight[..., None]
+        total[at] += own[-1] * weight[..., None]
         weights[at] += weight
-    return (total / np.maximum(weights, 1e-12)[..., None]).astype(np.float32)
+    return (total / np.maximum(weights, 1e-12)[..., None]).astype(np.float32), own
 
 
 def _from_rim(shot: Shot, seen: Seen) -> Array32:
@@ -380,9 +384,7 @@ def _finish(made: Plan, total: Array32, gamma: float) -> Mosaic:
     rgb = np.empty((3, *source.shape), np.uint8)
     for row in range(0, len(light), BLOCK):  # what is worked on stays in the processor's cache
         rows = slice(row, row + BLOCK)
-        rgb[:, rows] = [
-            levels.take(np.asarray(band, np.uint16), mode="wrap") for band in cv2.split(_as_16_bits(light[rows]))
-        ]
+        rgb[:, rows] = cv2.split(cv2.LUT(_as_16_bits(light[rows]), levels))
     return Mosaic(rgb, source >= 0, np.ascontiguousarray(source), np.ascontiguousarray(made.painted[at]))
 
 
@@ -398,13 +400,9 @@ def paint_over(image: Pixels, erase: Mask) -> Pixels:
     """
     if not erase.any():
         return image
-    size = erase.shape[1], erase.shape[0]
-    full = np.asarray(cv2.resize((~erase).astype(np.uint8), image.shape[1::-1], interpolation=cv2.INTER_NEAREST))
-    kept = np.asarray(cv2.copyTo(image, full, np.zeros_like(image)))
-    shrunk = cv2.resize(full * np.uint8(_WEIGHTS), size, interpolation=cv2.INTER_AREA).astype(np.float32) / _WEIGHTS
-    levels: list[tuple[NDArray, NDArray]] = [
-        (cv2.resize(kept, size, interpolation=cv2.INTER_AREA).astype(np.float32), shrunk)
-    ]
+    kept = (~erase).astype(np.uint8)
+    full = np.asarray(cv2.resize(kept, image.shape[1::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+    levels: list[tuple[NDArray, NDArray]] = [_known_shrunk(image, erase, full)]
     while levels[-1][1].min() < _PAINT_KNOWN and min(levels[-1][1].shape) > 1:
         colour, weight = levels[-1]
         levels.append((cv2.pyrDown(colour), cv2.pyrDown(weight)))
@@ -413,3 +411,14 @@ def paint_over(image: Pixels, erase: Mask) -> Pixels:
         filled = cv2.pyrUp(filled, dstsize=weight.shape[::-1]) * (1 - weight)[..., None] + colour
     smooth = cv2.resize(np.clip(np.rint(filled), 0, 255).astype(np.uint8), image.shape[1::-1])
     return np.asarray(cv2.copyTo(image, full, smooth), np.uint8)
+
+
+def _known_shrunk(image: Pixels, erase: Mask, full: Pixels) -> tuple[NDArray, NDArray]:
+    """The image as small as erase, of its pixels that are kept (full) alone, and their share."""
+    size = erase.shape[1], erase.shape[0]
+    if image.shape[0] % erase.shape[0] == 0 and image.shape[1] * erase.shape[0] == image.shape[0] * erase.shape[1]:
+        share = (~erase).astype(np.float32)  # a small pixel is kept whole or not at all
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) * share[..., None], share
+    kept = np.asarray(cv2.copyTo(image, full, np.zeros_like(image)))
+    share = cv2.resize(full * np.uint8(_WEIGHTS), size, interpolation=cv2.INTER_AREA).astype(np.float32) / _WEIGHTS
+    return cv2.resize(kept, size, interpolation=cv2.INTER_AREA).astype(np.float32), share

@@ -200,13 +200,16 @@ def see(place: Ground, shot: Shot, lie: Lie, feather_m: float) -> Seen | None:
     x, y = axes(nodes)
     X, Y, Z = (lie.A[k, 2] * place.z[at] + (lie.A[k, 0] * x + lie.b[k]) + lie.A[k, 1] * y[:, None] for k in range(3))
     u, v = _pixels_or_nan(table, X, Y, Z)
+    shown = np.isfinite(u)
+    if not shown.any():
+        return None
     away2 = X * X + Y * Y
     range_m = np.sqrt(away2 + Z * Z)
-    cost = np.sqrt(away2) + np.where(np.isnan(u), np.nan, 0)
+    cost = np.sqrt(away2) + np.where(shown, 0, np.nan)
     if place.terrain is not None:
         C = -np.linalg.inv(lie.A) @ lie.b
         cost += _oblique(place, at, nodes, C) + _hiding(place, nodes, C, feather_m)
-    quality = _quality_around(place, shot, u, v, float(np.nanmedian(Z)))
+    quality = _quality_around(place, shot, u, v, float(np.median(Z[shown])))
     return Seen(row, column, u, v, range_m.astype(np.float32), cost.astype(np.float32), quality)
 
 

@@ -21,6 +21,7 @@ _SPARSE = 2  # beyond this radius every second cell each way says enough
 _NOISE_M = 1e-3  # of weight one, so that single precision does
 _INTERVAL = 2.0  # sigmas
 _LEAST_CELLS = 6
+_TOGETHER = 32_768  # cells, whose sums stay in the processor's cache
 _SPIKE_CELLS = 5  # neighbours that can tell a cell that it stands out
 _CHANCE = 3.0  # sigmas of chi squared over its freedom: more is no plane
 
@@ -40,33 +41,69 @@ class _Moments(NamedTuple):
     zz: Array
 
 
+class _Around(NamedTuple):
+    """All cells with a rim of unknown ones, flat, in rows of `width`: x, y from their centres, cells; z; weights."""
+
+    width: int
+    x: Array
+    y: Array
+    z: Array
+    weight: Array
+
+
+class _Found(NamedTuple):
+    """Of some cells (n,): elevation and noise at their centres, whether it is there, by what the ground is uneven."""
+
+    elevation: Array
+    noise: Array
+    at_centre: Mask
+    uneven: Array
+
+
 def matched(grid: Grid, cells: Cells) -> Cells:
     """Cells with matched ones smoothed and carried to their centres; those of the laser as they are.
 
     A cell depends on those within four cells of it and on nothing else.
     """
-    wanted = cells.source == MATCHING
-    if not wanted.any():
+    wanted = np.flatnonzero(cells.source == MATCHING)
+    if not len(wanted):
         return cells
     X, Y = cell_centres(grid)
     x, y = (cells.x - X) / grid.cell_m, (cells.y - Y) / grid.cell_m
-    z = np.where(wanted, _without_spikes(cells.elevation), cells.elevation)
-    known = cells.density > 0
-    weight = np.where(known, (_NOISE_M / np.maximum(cells.noise, 1e-5)) ** 2, 0.0)
-    found, noise = z.copy(), cells.noise.copy()
-    low, high = np.full(grid.shape, -np.inf), np.full(grid.shape, np.inf)
-    going, at_centre, last = wanted.copy(), np.zeros(grid.shape, bool), 0
-    uneven = np.ones(grid.shape)
-    sums = _Moments(*(np.zeros(grid.shape, np.float32) for _ in _Moments._fields))
-    count = np.zeros(grid.shape, np.float32)
-    layers = [np.nan_to_num(values).astype(np.float32) for values in (x, y, weight)]
+    z = np.where(cells.source == MATCHING, _without_spikes(cells.elevation), cells.elevation)
+    weight = np.where(cells.density > 0, (_NOISE_M / np.maximum(cells.noise, 1e-5)) ** 2, 0.0)
+    rim = _RADII[-1]
+    layers = (np.pad(np.nan_to_num(values), rim).ravel() for values in (x, y, z, weight))
+    around = _Around(grid.width + 2 * rim, *(v if k == 2 else v.astype(np.float32) for k, v in enumerate(layers)))
+    here = (wanted // grid.width + rim) * around.width + wanted % grid.width + rim
+    parts = [_smoothed(around, here[k : k + _TOGETHER]) for k in range(0, len(here), _TOGETHER)]
+    found = _Found(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    elevation, sigma, noise, x, y = (
+        values.copy() for values in (cells.elevation, cells.sigma, cells.noise, cells.x, cells.y)
+    )
+    at, own = wanted[found.at_centre], cells.noise.ravel()[wanted]
+    elevation.ravel()[wanted] = found.elevation
+    # what neighbours differ by, beyond what noise makes them, no plane explains: edges, flanks, wrong matches
+    noise.ravel()[wanted] = np.where(found.at_centre, found.noise, own) * found.uneven
+    shared = np.maximum(cells.sigma.ravel()[wanted] ** 2 - own**2, 0)
+    sigma.ravel()[wanted] = np.sqrt(shared + noise.ravel()[wanted] ** 2)
+    x.ravel()[at], y.ravel()[at] = X.ravel()[at], Y.ravel()[at]
+    return cells._replace(elevation=elevation, sigma=sigma, noise=noise, x=x, y=y)
+
+
+def _smoothed(around: _Around, here: NDArray[np.int64]) -> _Found:
+    """The cells at some places among all, each by the largest plane that says the same as all smaller ones."""
+    z, count = around.z[here], np.zeros(len(here), np.float32)
+    found, noise, uneven = z.copy(), np.zeros(len(here)), np.ones(len(here))
+    low, high = np.full(len(here), -np.inf), np.full(len(here), np.inf)
+    going, at_centre, last = np.ones(len(here), bool), np.zeros(len(here), bool), 0
+    sums = _Moments(*(np.zeros(len(here), np.float32) for _ in _Moments._fields))
     for radius in _RADII:
-        _add_ring(sums, count, (last, radius), np.nan_to_num(z), *layers)
+        _add_ring(sums, count, (last, radius), around, here)
         last = radius
         height, variance, misfit = _plane(sums, count)
         if radius == _RADII[0]:
-            torn = wanted & (count >= _LEAST_CELLS) & (misfit > _most(count))
-            uneven = np.sqrt(np.where(torn, misfit, 1))
+            uneven = np.sqrt(np.where((count >= _LEAST_CELLS) & (misfit > _most(count)), misfit, 1))
         enough = going & (count >= _LEAST_CELLS) & np.isfinite(height) & (variance > 0)
         height = np.where(enough, height, 0.0)
         spread = _INTERVAL * np.sqrt(np.where(enough, variance, 0))
@@ -79,16 +116,7 @@ def matched(grid: Grid, cells: Cells) -> Cells:
         found[better], noise[better] = (z + height)[better], np.sqrt(variance[better])
         at_centre |= better
         going &= better | ~enough
-    # what neighbours differ by, beyond what noise makes them, no plane explains: edges, flanks, wrong matches
-    noise *= uneven
-    sigma = np.sqrt(np.maximum(cells.sigma**2 - cells.noise**2, 0) + noise**2)
-    return cells._replace(
-        elevation=found,
-        sigma=np.where(wanted, sigma, cells.sigma),
-        noise=noise,
-        x=np.where(at_centre, X, cells.x),
-        y=np.where(at_centre, Y, cells.y),
-    )
+    return _Found(found, noise, at_centre, uneven)
 
 
 def _most(count: Array) -> Array:
@@ -108,27 +136,23 @@ def _without_spikes(z: Array) -> Array:
     return np.where(count >= _SPIKE_CELLS, np.clip(z, low, high), z)
 
 
-def _add_ring(
-    sums: _Moments, count: Array, radii: tuple[int, int], z: Array, x: Array, y: Array, weight: Array
-) -> None:
+def _add_ring(sums: _Moments, count: Array, radii: tuple[int, int], around: _Around, here: NDArray[np.int64]) -> None:
     """Adds the cells between two squares to the sums, in place; with the smaller of radius 0 also the cell itself."""
     inner, outer = radii
-    height, width = z.shape
     every = _SPARSE if outer > _SPARSE else 1
     for i in range(-outer, outer + 1, every):
         for j in range(-outer, outer + 1, every):
             if inner and max(abs(i), abs(j)) <= inner:
                 continue
-            here = slice(max(0, -i), height - max(0, i)), slice(max(0, -j), width - max(0, j))
-            there = slice(max(0, i), height + min(0, i)), slice(max(0, j), width + min(0, j))
+            there = here + i * around.width + j
             # rows go south
-            w, dx, dy = weight[there], x[there] + j, y[there] - i
-            dz = (z[there] - z[here]).astype(np.float32)
+            w, dx, dy = around.weight[there], around.x[there] + j, around.y[there] - i
+            dz = (around.z[there] - around.z[here]).astype(np.float32)
             wx, wy, wz = w * dx, w * dy, w * dz
             terms = (w, wx, wy, wx * dx, wx * dy, wy * dy, wz, wx * dz, wy * dz, wz * dz)
             for total, term in zip(sums, terms, strict=True):
-                total[here] += term
-            count[here] += w > 0
+                total += term
+            count += w > 0
 
 
 def _plane(m: _Moments, count: Array) -> tuple[Array, Array, Array]:

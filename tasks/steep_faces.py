@@ -60,6 +60,17 @@ class Place(NamedTuple):
     height: int
 
 
+def any_steep(X_map: Array, triangles: Faces) -> bool:
+    """Whether there is anything to cut out, of vertices (V, 3) and triangles (T, 3)."""
+    return bool((_ups(X_map[triangles])[1] < STEEPEST_UP).any())
+
+
+def _ups(corners: Array) -> tuple[Array, Array]:
+    """Normals (T, 3), twice the area long, of faces with corners (T, 3, 3); and how much each points up, 0 to 1."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normal, normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+
+
 def charts(
     X_map: Array,
     triangles: Faces,
@@ -75,8 +86,7 @@ def charts(
     the mesh was made from. times : by an image's number, how many times smaller it is read.
     """
     corners = X_map[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    up = normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+    normal, up = _ups(corners)
     steep = np.flatnonzero(up < STEEPEST_UP)
     if not len(steep) or not views:
         return []

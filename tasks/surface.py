@@ -153,9 +153,24 @@ def _runs(first: NDArray[np.int64], length: NDArray[np.int64]) -> tuple[NDArray[
     return run, np.arange(len(run)) - np.repeat(np.cumsum(length) - length, length) + first[run]
 
 
+def _around(grid: Grid, xy: Array, wanted: Mask) -> Mask:
+    """Which triangles (T, 3, 2), map metres, may lie over a wanted cell."""
+    x, y = xy[..., 0] / grid.cell_m - grid.left - 0.5, grid.top - xy[..., 1] / grid.cell_m - 0.5
+    first, last = (
+        (np.clip(np.ceil(at.min(1)), 0, size), np.clip(np.floor(at.max(1)) + 1, 0, size))
+        for at, size in ((x, grid.width), (y, grid.height))
+    )
+    (left, right), (top, bottom) = (tuple(edge.astype(int) for edge in edges) for edges in (first, last))
+    total = cv2.integral(wanted.astype(np.uint8))
+    count = total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left]
+    return (right > left) & (bottom > top) & (count > 0)
+
+
 def _reach(grid: Grid, cells: Cells, wanted: Mask, max_distance_m: float) -> _Reach:
     """Triangles over the wanted cells, none of which may lie deep in densely sounded ground."""
     corners, xy = _triangles(grid, cells, max_distance_m)
+    near = _around(grid, xy, wanted)
+    corners, xy = corners[near], xy[near]
     owner = _rasterise(grid, xy)
     owner[~wanted.ravel()] = -1
     cell = np.flatnonzero(owner >= 0)
@@ -179,7 +194,17 @@ def _interpolated(cells: Cells, reach: _Reach) -> tuple[Array, Array, Array]:
     return elevation, (w * sigma).sum(1), spread
 
 
-def delaunay_surface(grid: Grid, cells: Cells, max_distance_m: float, growth: Growth) -> Surface:
+def _inside(grid: Grid, part: Grid | None) -> Mask:
+    """Cells of a grid that are in a part of it; all where no part is given."""
+    inside = np.full(grid.shape, part is None)
+    if part is not None:
+        inside[window(grid, part)] = True
+    return inside
+
+
+def delaunay_surface(
+    grid: Grid, cells: Cells, max_distance_m: float, growth: Growth, counted: Grid | None = None
+) -> Surface:
     """Elevation at the centre of each cell, sounded or not, from the triangles of the soundings (paper IV).
 
     Parameters
@@ -189,15 +214,16 @@ def delaunay_surface(grid: Grid, cells: Cells, max_distance_m: float, growth: Gr
     max_distance_m : radius of the largest empty circle that is bridged, m; no cell farther than this from a
         sounding is filled.
     growth : the mission's, by `fit_growth`.
+    counted : the part of the grid whose cells count; the others are left as they came.
     """
-    sounded, dense = cells.density > 0, _dense(cells, _RIM_CELLS)
+    sounded, dense, inside = cells.density > 0, _dense(cells, _RIM_CELLS), _inside(grid, counted)
     elevation, sigma, source = cells.elevation.copy(), cells.sigma.copy(), cells.source.copy()
-    reach = _reach(grid, cells, ~dense, max_distance_m)
+    reach = _reach(grid, cells, ~dense & inside, max_distance_m)
     z, own, spread = _interpolated(cells, reach)
     grown = growth_sigma(growth, reach.distance, spread)
     elevation.ravel()[reach.cell], sigma.ravel()[reach.cell] = z, np.hypot(own, grown)
     source.ravel()[reach.cell] = np.where(sounded.ravel()[reach.cell], source.ravel()[reach.cell], INTERPOLATED)
-    _to_centres(grid, cells, dense, elevation)
+    _to_centres(grid, cells, dense & inside, elevation)
     return Surface(elevation, sigma, source)
 
 
@@ -279,10 +305,7 @@ def hold_out(grid: Grid, cells: Cells, max_distance_m: float, counted: Grid | No
 
     counted : the part of the grid whose cells count, so that tiles give what the whole map would.
     """
-    inside = np.ones(grid.shape, bool)
-    if counted is not None:
-        inside[:] = False
-        inside[window(grid, counted)] = True
+    inside = _inside(grid, counted)
     row, column = np.mgrid[grid.top : grid.top - grid.height : -1, grid.left : grid.left + grid.width]
     found = []
     for k, share in enumerate((16, 8, 4, 2)):
@@ -290,11 +313,9 @@ def hold_out(grid: Grid, cells: Cells, max_distance_m: float, counted: Grid | No
         out = ((column // side) * 3 + (row // side) * 5 + k) % 8 == 0
         out &= cells.density > 0
         rest = cells._replace(density=np.where(out, np.int32(0), cells.density))
-        reach = _reach(grid, rest, out, max_distance_m)
+        reach = _reach(grid, rest, out & inside, max_distance_m)
         z, _, spread = _interpolated(rest, reach)
-        here = inside.ravel()[reach.cell]
-        error = np.abs(z - cells.elevation.ravel()[reach.cell])
-        found.append((error[here], reach.distance[here], spread[here]))
+        found.append((np.abs(z - cells.elevation.ravel()[reach.cell]), reach.distance, spread))
     return Holdout(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 

@@ -90,9 +90,11 @@ def horizon(terrain: Terrain) -> Array:
     for reach in [*_RINGS, max(z.shape)]:
         if reach <= nearer:
             continue
-        window = np.ones((2 * (reach - nearer) + 1,) * 2, np.uint8)
-        within = cv2.dilate(highest, window, borderType=cv2.BORDER_CONSTANT, borderValue=-np.inf)
-        highest = within if reach in _RINGS else np.full(z.shape, highest.max(initial=-np.inf))
+        if reach in _RINGS:
+            window = np.ones((2 * (reach - nearer) + 1,) * 2, np.uint8)
+            highest = cv2.dilate(highest, window, borderType=cv2.BORDER_CONSTANT, borderValue=-np.inf)
+        else:
+            highest = np.full(z.shape, highest.max(initial=-np.inf))
         with np.errstate(invalid="ignore"):
             rise = (highest - z) / terrain.grid.cell_m - 1
         steepest = np.fmax(steepest, rise / (nearer + 1))

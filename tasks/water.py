@@ -55,11 +55,11 @@ class Water(NamedTuple):
     """
 
     light: Array32
-    attenuation: Array
+    attenuation: NDArray[np.floating]
     spreading: float
-    veil: Array
+    veil: NDArray[np.floating]
     range_m: float
-    balance: Array
+    balance: NDArray[np.floating]
 
 
 class _Law(NamedTuple):
@@ -112,11 +112,11 @@ def tone(water: Water, light: Array32, range_m: Array32) -> tuple[Array32, Array
     return gain.astype(np.float32), (gain * _veil(share[..., None], water.veil)).astype(np.float32)
 
 
-def _signal(share: NDArray, attenuation: Array, spreading: float) -> Array:
+def _signal(share: NDArray, attenuation: NDArray, spreading: float) -> NDArray:
     return np.exp(-attenuation * (share - 1)) * share**-spreading
 
 
-def _veil(share: NDArray, veil: Array) -> Array:
+def _veil(share: NDArray, veil: NDArray) -> NDArray:
     return veil * np.expm1(-_BUILDS_UP * share) / np.expm1(-_BUILDS_UP)
 
 

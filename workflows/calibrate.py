@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -49,19 +49,29 @@ def prepare(out: Path) -> None:
     ------
     InvalidInput
     """
+    if out.parts[:1] and out.parts[0].endswith(":"):
+        remedy = "Write it to this machine, and copy it from there."
+        raise InvalidInput([Problem(str(out), None, "", "a URL", "a local folder", remedy)])
     if (out / CALIBRATION).exists():
         remedy = "Choose another folder; calibrations are never overwritten."
         raise InvalidInput([Problem(str(out / CALIBRATION), None, "", "a calibration", "no such file yet", remedy)])
     if out.exists() and not out.is_dir():
         remedy = "Give --out a folder, which need not exist."
         raise InvalidInput([Problem(str(out), None, "", "a file", "a folder", remedy)])
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        refused = None if os.access(out, os.W_OK) else "a folder that may not be written"
+    except OSError as error:
+        refused = error.strerror or str(error)
+    if refused:
+        remedy = "Choose another folder, or give yourself the right to write there."
+        raise InvalidInput([Problem(str(out), None, "", refused, "a folder that can be written", remedy)])
 
 
 def write(out: Path, calibration: Calibration, page: report.Page) -> Written:
     """Write both files, each whole or not at all."""
     content = json.loads(calibration.model_dump_json(exclude_none=True))
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
-    out.mkdir(parents=True, exist_ok=True)
     paths = out / CALIBRATION, out / REPORT
     temporary = paths[0].with_name(f".{CALIBRATION}.{os.getpid()}")
     temporary.write_text(text, encoding="utf-8")
@@ -108,19 +118,31 @@ class Sheets(NamedTuple):
 def with_sheets(start: Calibration, sheets: Sheets) -> Laser:
     """The laser of a calibration with other sheets."""
     assert start.laser is not None
-    return Laser(wavelength_nm=start.laser.wavelength_nm, origin=start.laser.origin, planes=sheets.planes)
+    return start.laser.model_copy(update={"planes": sheets.planes})
 
 
 def sheets_and_mount(
     start: Calibration, sheets: Sheets, covariance: Array, mount: Sequence[str]
 ) -> tuple[CovarianceBlock, ...]:
-    """One block of both sheets and the mount's angles (degrees); the starting calibration's block of the camera."""
+    """One block of both sheets and the mount's angles (degrees), and what the start knew of all else."""
     count = len(mount)
     J = np.zeros((8 + count, 6 + count))
     J[:8, :6], J[8:, 6:] = sheets.jacobian, np.degrees(np.eye(count))
     names = [*sheets.names, *(f"mount.rotation.{name}" for name in mount)]
-    kept = [b for b in start.covariance if all(name.startswith("camera.") for name in b.parameters)]
-    return (*kept, block(names, J @ covariance[: 6 + count, : 6 + count] @ J.T))
+    return (
+        *known_of(start, lambda name: not name.startswith("laser.") and name not in names),
+        block(names, J @ covariance[: 6 + count, : 6 + count] @ J.T),
+    )
+
+
+def known_of(start: Calibration, wanted: Callable[[str], bool]) -> tuple[CovarianceBlock, ...]:
+    """The covariances of some parameters in a calibration."""
+    found = []
+    for one in start.covariance:
+        kept = [k for k, name in enumerate(one.parameters) if wanted(name)]
+        if kept:
+            found.append(block([one.parameters[k] for k in kept], np.array(one.matrix)[np.ix_(kept, kept)]))
+    return tuple(found)
 
 
 def sheet_rows(sheets: Sheets) -> list[report.Row]:
@@ -154,10 +176,15 @@ def sensitivity_picture(calibration: Calibration, sheets: Sheets, shown: Array) 
 
 def accuracy_statement(calibration: Calibration, sheets: Sheets, shown: Array) -> str:
     """The altitude's sigma at three altitudes, in words."""
-    three = shown[[0, len(shown) // 2, -1]]
     covariance = sheets.jacobian @ sheets.covariance @ sheets.jacobian.T
-    sigma = sensitivity(calibration.camera, sheets.planes, three).sigma_m(covariance)
-    parts = [f"{1e3 * s:.2g} mm ({100 * s / a:.2g} %) at {a:.2f} m" for s, a in zip(sigma, three, strict=True)]
+    sigma = sensitivity(calibration.camera, sheets.planes, shown).sigma_m(covariance)
+    lit = np.flatnonzero(np.isfinite(sigma))
+    if not len(lit):
+        return "At none of these altitudes does the camera see the laser on level ground."
+    three = lit[[0, len(lit) // 2, -1]]
+    parts = [
+        f"{1e3 * s:.2g} mm ({100 * s / a:.2g} %) at {a:.2f} m" for s, a in zip(sigma[three], shown[three], strict=True)
+    ]
     return "Mean altitudes over level ground are known to " + ", ".join(parts) + " (1-sigma, by this calibration)."
 
 
@@ -180,6 +207,8 @@ def port_parts(calibration: Calibration, shown: Array) -> tuple[list[str], list[
     if calibration.camera.port is None or calibration.laser is None:
         return [], []
     error = pinhole_error(calibration.camera, calibration.laser, shown)
+    if not np.isfinite(error.fitted_percent).any():
+        return [], []
     worst = int(np.nanargmax(np.abs(error.fitted_percent)))
     said = (
         "With a pinhole (brown) camera fitted in water instead of this port's exact refraction, sheets fitted with it, "

@@ -16,7 +16,7 @@ from ..tasks import calibration_board as adjusting
 from ..tasks import calibration_board_start as starting
 from ..tasks import calibration_targets as targets
 from ..tasks.board_shape import heights
-from ..tasks.calibration_lines import averaged, cross_on_flat
+from ..tasks.calibration_lines import Area, averaged, cross_on_flat
 from ..tasks.calibration_sheets import as_plane, basis, block, sheet_names, step_jacobian
 from . import calibrate
 from . import calibration_report as report
@@ -28,6 +28,9 @@ Lines = Literal["cross"] | int
 
 PLANES: Final = "planes.yaml"
 _MIN_IMAGES: Final = 4
+_LEAST_LIT: Final = 3  # photographs with light
+_LEAST_OF_SHEET: Final = 2  # of them, with that of each sheet
+_LEAST_BENT: Final = 10  # photographs from which a board's shape can be told
 _GROW: Final = 0.15
 _KINDS: Final = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 _FREE: Final = {
@@ -81,7 +84,7 @@ def run_board(folder: Path, out: Path, setup: BoardSetup, parameters: Parameters
     camera = _first_camera(seen, setup)
     free = () if setup.hold_camera else _free(camera.model, len(seen.names))
     found = adjusting.calibrate_board(_data(seen), camera, free, setup.bent)
-    result = _calibration(found, setup)
+    result = _calibration(found, setup, free)
     written = calibrate.write(out, result, _page(folder, seen, setup, found, free, result))
     if result.laser is None and len(found.sheets):
         _write_planes(out / PLANES, found)
@@ -142,10 +145,8 @@ def _enough(folder: Path, setup: BoardSetup, names: list, sizes: list, light: li
         found = f"{len(names)} images with a {setup.board.kind} of {size}"
         remedy = "Count inner corners for a chessboard and squares for ChArUco; light it evenly; show all of it."
         problems.append(Problem(str(folder), None, "", found, f"at least {_MIN_IMAGES}", remedy))
-    elif sum(len(one.uv) > 0 for one in light) < 3:
-        found = f"the laser in {sum(len(one.uv) > 0 for one in light)} of them"
-        remedy = "Check --lines, and whether the light is on the board or --beside it."
-        problems.append(Problem(str(folder), None, "", found, "the laser in at least 3", remedy))
+    else:
+        problems += _too_dark(folder, setup, light)
     if len(set(sizes)) > 1:
         found = "images of " + ", ".join(f"{w} x {h}" for w, h in sorted(set(sizes)))
         problems.append(Problem(str(folder), None, "", found, "one size", "Take all with one camera setting."))
@@ -153,16 +154,38 @@ def _enough(folder: Path, setup: BoardSetup, names: list, sizes: list, light: li
         raise InvalidInput(problems)
 
 
-def _light(bgr: NDArray[np.uint8], corner_uv: Array, setup: BoardSetup, parameters: Parameters) -> targets.Light:
-    """The lines on the board's plane, and no other light."""
-    outline = targets.outline(corner_uv, 0.0 if not setup.beside else _GROW)
+def _too_dark(folder: Path, setup: BoardSetup, light: list[targets.Light]) -> Iterator[Problem]:
+    """Every sheet has to be seen in two photographs or more: about the line of a single one it could turn freely."""
+    remedy = "Check --lines, and whether the light is on the board or --beside it; hold it so that every line is on it."
+    if sum(len(one.uv) > 0 for one in light) < _LEAST_LIT:
+        found = f"the laser in {sum(len(one.uv) > 0 for one in light)} of them"
+        yield Problem(str(folder), None, "", found, f"the laser in at least {_LEAST_LIT}", remedy)
+        return
+    for sheet, name in enumerate(_sheet_names(setup)):
+        lit = sum(bool((one.sheet == sheet).any()) for one in light)
+        if lit < _LEAST_OF_SHEET:
+            found = f"the laser's sheet {name} in {lit} of them"
+            yield Problem(str(folder), None, "", found, f"in at least {_LEAST_OF_SHEET}", remedy)
+
+
+def _sheet_names(setup: BoardSetup) -> list[str]:
+    """Names of the sheets, of which those of parallel lines are numbers from the left."""
     if setup.lines != "cross":
-        return targets.parallel_lines(bgr, outline if setup.beside else None, setup.lines, parameters.laser)
+        return [str(k) for k in range(setup.lines)]
     assert setup.start is not None
     assert setup.start.laser is not None
-    found = cross_on_flat(bgr, setup.start.camera, setup.start.laser.sheets, parameters.laser)
-    keep = targets.inside(found.uv, outline) != setup.beside if len(found.uv) else np.zeros(0, bool)
-    return targets.Light(found.uv[keep], found.arm[keep].astype(np.intp), found.sigma_px[keep])
+    return [sheet.name for sheet in setup.start.laser.sheets]
+
+
+def _light(bgr: NDArray[np.uint8], corner_uv: Array, setup: BoardSetup, parameters: Parameters) -> targets.Light:
+    """The lines on the board's plane, and no other light."""
+    area = Area(targets.outline(corner_uv, _GROW if setup.beside else 0.0), setup.beside)
+    if setup.lines != "cross":
+        return targets.parallel_lines(bgr, area, setup.lines, parameters.laser)
+    assert setup.start is not None
+    assert setup.start.laser is not None
+    found = cross_on_flat(bgr, setup.start.camera, setup.start.laser.sheets, parameters.laser, area)
+    return targets.Light(found.uv, found.arm.astype(np.intp), found.sigma_px)
 
 
 def _data(seen: _Seen) -> adjusting.BoardData:
@@ -180,8 +203,8 @@ def _data(seen: _Seen) -> adjusting.BoardData:
     )
 
 
-def _calibration(found: adjusting.BoardResult, setup: BoardSetup) -> Calibration:
-    """The calibration with the covariance of camera and sheets."""
+def _calibration(found: adjusting.BoardResult, setup: BoardSetup, free: Sequence[str]) -> Calibration:
+    """The calibration with the covariance of camera and sheets; of a camera that was held, what the start knew."""
     count = len(found.camera_names)
     names = [f"camera.{n}" if n in ("fx", "fy", "cx", "cy") else f"camera.distortion.{n}" for n in found.camera_names]
     laser, J = None, np.eye(count)
@@ -198,15 +221,22 @@ def _calibration(found: adjusting.BoardResult, setup: BoardSetup) -> Calibration
             J[count + 4 * s : count + 4 * s + 4, count + 3 * s : count + 3 * s + 3] = own
             names += sheet_names(old.sheets[s].name)
     covariance = J @ found.covariance[: J.shape[1], : J.shape[1]] @ J.T
-    kept = [k for k, name in enumerate(names) if not name.startswith("camera.") or covariance[k, k] > 1e-18]
+    kept = [k for k, name in enumerate(names) if name.startswith("laser.") or name.rpartition(".")[2] in free]
     mount = setup.start.mount if setup.start is not None else Mount()
+    left = () if setup.start is None else calibrate.known_of(setup.start, lambda name: _left(name, setup.hold_camera))
+    own = (block([names[k] for k in kept], covariance[np.ix_(kept, kept)]),) if kept else ()
     return Calibration(
         format=1,
         camera=found.camera,
         laser=laser,
         mount=mount,
-        covariance=(block([names[k] for k in kept], covariance[np.ix_(kept, kept)]),) if kept else (),
+        covariance=(*left, *own),
     )
+
+
+def _left(name: str, hold_camera: bool) -> bool:
+    """Whether a calibration with a board leaves a parameter as it was."""
+    return name.startswith("mount.") or (hold_camera and name.startswith("camera."))
 
 
 def _facing(sheet: Array, normal: Array) -> Array:
@@ -215,26 +245,38 @@ def _facing(sheet: Array, normal: Array) -> Array:
 
 
 def _write_planes(path: Path, found: adjusting.BoardResult) -> None:
-    """Sheets that calibration.yaml has no place for: normal . X = offset, camera frame, metres."""
+    """Sheets that calibration.yaml has no place for: normal . X = offset, camera frame, metres, with covariances."""
     planes = [
-        {"name": str(s), "normal": [float(v) for v in sheet[:3]], "offset": float(sheet[3])}
+        {
+            "name": str(s),
+            "normal": [float(v) for v in sheet[:3]],
+            "offset": float(sheet[3]),
+            "covariance": _sheet_covariance(found, s).tolist(),
+        }
         for s, sheet in enumerate(found.sheets)
     ]
     path.write_text(yaml.safe_dump({"planes": planes}, sort_keys=False, default_flow_style=None, width=120))
+
+
+def _sheet_covariance(found: adjusting.BoardResult, sheet: int) -> Array:
+    """(4, 4) of a sheet's normal and offset."""
+    first = len(found.camera_names) + 3 * sheet
+    own, J = slice(first, first + 3), step_jacobian(found.starts[sheet], found.steps[3 * sheet : 3 * sheet + 3])
+    return J @ found.covariance[own, own] @ J.T
 
 
 def _rows(found: adjusting.BoardResult, free: Sequence[str], result: Calibration) -> list[report.Row]:
     sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0))
     of_camera = dict(zip(found.camera_names, sigma.tolist(), strict=False))
     rows = report.camera_rows(result, {name: s for name, s in of_camera.items() if name in free})
-    for s, sheet in enumerate(found.sheets[:4]):
-        own = sigma[len(found.camera_names) + 3 * s :][:3]
-        turn = float(np.degrees(np.hypot(own[0], own[1])))
+    for s, sheet in enumerate(found.sheets):
+        away, leans = abs(float(sheet[3])), min(abs(float(sheet[2])), 1.0)
+        _, _, of_normal, of_offset = np.sqrt(np.diag(_sheet_covariance(found, s))).tolist()
+        rows.append(report.Row(f"sheet {s}: distance from the camera", "mm", 1e3 * away, 1e3 * of_offset))
+        turn = float(np.degrees(of_normal / np.sqrt(max(1 - leans**2, 1e-9))))
         rows.append(
-            report.Row(f"sheet {s}: distance from the camera", "mm", 1e3 * float(abs(sheet[3])), 1e3 * float(own[2]))
+            report.Row(f"sheet {s}: angle to the optical axis", "deg", float(np.degrees(np.arcsin(leans))), turn)
         )
-        angle = float(np.degrees(np.arcsin(np.clip(abs(sheet[2]), 0, 1))))
-        rows.append(report.Row(f"sheet {s}: angle to the optical axis", "deg", angle, turn))
     return rows
 
 
@@ -351,6 +393,8 @@ def _warnings(seen: _Seen, found: adjusting.BoardResult) -> list[str]:
     covered = np.ptp(uv, axis=0) / np.array(seen.size)
     if covered.min() < 0.6:
         said.append("the board was never shown near the edges of the image: distortion there is a guess")
+    if len(found.shape.terms) and len(seen.names) < _LEAST_BENT:
+        said.append(f"the board's shape rests on {len(seen.names)} photographs; take {_LEAST_BENT} or more")
     if found.corner_sigma_px > 0.3:
         remedy = "" if len(found.shape.terms) else "; --bent estimates its shape"
         said.append(

@@ -98,6 +98,13 @@ def board(
     if not dictionary.startswith("DICT_") or not hasattr(cv2.aruco, dictionary):
         remedy = "Write DICT_4X4_50, DICT_5X5_100 or another of OpenCV's."
         raise InvalidInput([Problem("--dictionary", None, "", dictionary, "a dictionary of markers", remedy)])
+    if hold_camera and begun is None:
+        remedy = "Add --start calibration.yaml, or leave --hold-camera out."
+        raise InvalidInput([Problem("--hold-camera", None, "", "no --start", "the camera to hold", remedy)])
+    if bent and kind == "chessboard" and (columns + rows) % 2 == 0:
+        remedy = "Use a board of which one number is even and the other odd, or a ChArUco board."
+        found = f"{columns} x {rows} corners, which look the same upside down"
+        raise InvalidInput([Problem("--bent", None, "", found, "a board whose way up can be told", remedy)])
     target = Board(kind, columns, rows, 1e-3 * square_mm, marker_share, dictionary)
     setup = calibrate_board.BoardSetup(target, _lines(lines, begun), beside, begun, hold_camera, model, bent)
     _show(calibrate_board.run_board(folder, out, setup, Parameters()))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..schemas.calibration import Calibration, Laser, Mount
+from ..schemas.calibration import Calibration, Mount
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..tasks import calibration_crossovers as crossovers
@@ -94,10 +94,7 @@ def _calibration(start: Calibration, starts: tuple, x: np.ndarray) -> Calibratio
     assert start.laser is not None
     sheets = field.sheets_of(x, starts)
     first, second = (as_plane(basis.name, sheet) for basis, sheet in zip(starts, sheets, strict=True))
-    light = Laser(wavelength_nm=start.laser.wavelength_nm, origin=start.laser.origin, planes=(first, second))
-    rotation = tuple(np.array(start.mount.rotation) + np.degrees(x[6:9]))
-    mount = Mount(translation=start.mount.translation, rotation=rotation)
-    return start.model_copy(update={"laser": light, "mount": mount})
+    return start.model_copy(update={"laser": start.laser.model_copy(update={"planes": (first, second)})})
 
 
 def _problem(

@@ -18,6 +18,10 @@ from . import calibration_report as report
 Array = NDArray[np.float64]
 
 _LEVELS: Final = 4
+_OF_MOUNT: Final = (
+    "Mount angles cannot be told from constant errors of the navigation's roll and pitch; their sigma includes those "
+    "as the mission states them."
+)
 
 
 def run_flat(
@@ -39,7 +43,10 @@ def run_flat(
     calibrate.prepare(out)
     first = inputs.open_survey(missions[0], start, laser_only=True, level_floor=True)
     calibration = first.opened.calibration
-    others = [inputs.open_survey(url, calibration, laser_only=True, level_floor=True) for url in missions[1:]]
+    given = "--start" if start else f"{missions[0]}/{first.opened.mission.calibration}"
+    others = [
+        inputs.open_survey(url, calibration, laser_only=True, level_floor=True, given=given) for url in missions[1:]
+    ]
     share = max(4, images // len(missions))
     surveys = [survey._replace(rows=inputs.spread(survey.rows, share)) for survey in (first, *others)]
     data, unused = inputs.flat_data(surveys, [inputs.flat_lines(survey, parameters) for survey in surveys])
@@ -50,7 +57,9 @@ def run_flat(
         update={
             "laser": calibrate.with_sheets(calibration, sheets),
             "mount": Mount(translation=calibration.mount.translation, rotation=rotation),
-            "covariance": calibrate.sheets_and_mount(calibration, sheets, found.covariance, calibrate.MOUNT[:2]),
+            "covariance": calibrate.sheets_and_mount(
+                calibration, sheets, found.covariance, calibrate.MOUNT[: 2 * boresight]
+            ),
         }
     )
     page = _flat_page(missions, data, calibration, priors, boresight, found, sheets, result)
@@ -69,7 +78,8 @@ def _flat_page(
     sheets: calibrate.Sheets,
     result: Calibration,
 ) -> report.Page:
-    ranges = _floor_ranges(data, start)
+    by_image = _floor_ranges(data, start)
+    ranges = by_image[np.isfinite(by_image)]
     shown = calibrate.altitudes(float(ranges.min()), float(ranges.max()))
     sigma = np.degrees(np.sqrt(np.diag(found.covariance)[6:]))
     rows = calibrate.sheet_rows(sheets)
@@ -83,7 +93,7 @@ def _flat_page(
     size = (start.camera.width, start.camera.height)
     names = [f"sheet {s.name}" for s in found.starts]
     residuals = report.residual_map(data.uv[lit], 1e3 * found.residual_m[lit], size, data.arm[lit], names, "mm")
-    by_image = report.bars(list(1e3 * found.image_m.T), names, "image", "mean height above the floor (mm)")
+    means = report.bars(list(1e3 * found.image_m.T), names, "image", "mean height above the floor (mm)")
     facts = (
         ("Missions", ", ".join(missions)),
         ("Images with both lines", f"{len(data.X_local)}"),
@@ -104,15 +114,14 @@ def _flat_page(
             f"The scale rests on the altimeter and the mount's lever arm: a constant error of either goes into every "
             f"altitude; it was taken as {1e3 * priors.altimeter_m:.2g} mm (1-sigma), and several altitudes find "
             f"{1e3 * found.altimeter_m[0]:.2f} ± {1e3 * found.altimeter_m[1]:.2f} mm of it.",
-            "Mount angles cannot be told from constant errors of the navigation's roll and pitch; their sigma "
-            "includes those as the mission states them.",
+            *([_OF_MOUNT] if boresight else []),
             *said,
         ),
         left_out_header=("Left out", "images", *(f"change of altitude by {name}" for name in names)),
-        left_out=tuple(_flat_left_out(data, start, priors, boresight, found, ranges)),
+        left_out=tuple(_flat_left_out(data, start, priors, boresight, found, by_image)),
         pictures=(
             report.picture("Residuals in the image", residuals, "Heights above the floor, where they were measured."),
-            report.picture("Residuals by image", by_image, "Mean height of each image's points above the floor."),
+            report.picture("Residuals by image", means, "Mean height of each image's points above the floor."),
             calibrate.sensitivity_picture(result, sheets, shown),
             *figures,
         ),
@@ -135,21 +144,19 @@ def _flat_warnings(ranges: Array) -> list[str]:
 
 
 def _floor_ranges(data: flat.FlatData, calibration: Calibration) -> Array:
-    """Height of each camera above the floor (n,), by the altimeter."""
-    lever = data.R_local_vehicle @ np.asarray(calibration.mount.translation)
-    ranges = data.altitude_m + lever[:, 2]
-    known = ranges[np.isfinite(ranges)]
-    return known if len(known) else np.array([2.5])
+    """Height of each camera above the floor (n,), by the altimeter; NaN where that was blind."""
+    return data.altitude_m + (data.R_local_vehicle @ np.asarray(calibration.mount.translation))[:, 2]
 
 
 def _flat_left_out(
     data: flat.FlatData, start: Calibration, priors: flat.Priors, boresight: bool, full: flat.FlatResult, ranges: Array
 ) -> list[report.LeftOut]:
     """What happens to the altitude of a quarter of the images, by height, if the calibration does not know them."""
-    if len(ranges) != len(data.X_local) or len(ranges) < 2 * _LEVELS:
+    known = np.flatnonzero(np.isfinite(ranges))
+    if len(known) < 2 * _LEVELS:
         return []
     lines = []
-    for part in np.array_split(np.argsort(ranges, kind="stable"), _LEVELS):
+    for part in np.array_split(known[np.argsort(ranges[known], kind="stable")], _LEVELS):
         found = flat.calibrate_flat(data.take(~np.isin(data.image, part)), start, priors, boresight)
         at = float(ranges[part].mean())
         change = [altitude_error(start.camera, full.sheets[s], found.sheets[s], at) for s in (0, 1)]

@@ -69,8 +69,12 @@ class Survey(NamedTuple):
     rows: NDArray[np.intp]
 
 
-def open_survey(url: str, start: Calibration | None, laser_only: bool, level_floor: bool) -> Survey:
+def open_survey(
+    url: str, start: Calibration | None, laser_only: bool, level_floor: bool, given: str = "--start"
+) -> Survey:
     """Open a mission with navigation, its calibration replaced by `start` if given.
+
+    given : where `start` comes from, for errors.
 
     Raises
     ------
@@ -80,14 +84,15 @@ def open_survey(url: str, start: Calibration | None, laser_only: bool, level_flo
     opened = open_mission(url, hashed=False, smooth_s=SMOOTH_S, level_floor=level_floor)
     problems = []
     if start is not None:
-        problems += _size_problems(url, opened, start)
+        problems += _size_problems(url, opened, start, given)
         opened = opened._replace(calibration=start)
     if opened.crs is None:
         remedy = "Add navigation to mission.yaml, or calibrate with a board."
         problems.append(Problem(f"{url}/mission.yaml", 1, "navigation", "none", "navigation", remedy))
     if opened.calibration.laser is None:
         remedy = "Add laser to the calibration to start from: baseline, angle and roll by tape measure will do."
-        problems.append(Problem(f"{url}/{opened.mission.calibration}", 1, "laser", "none", "a laser", remedy))
+        where = f"{url}/{opened.mission.calibration}" if start is None else given
+        problems.append(Problem(where, None, "laser", "none", "a laser", remedy))
     if problems:
         raise InvalidInput(problems)
     made = plan.plan(opened, Parameters())
@@ -95,13 +100,13 @@ def open_survey(url: str, start: Calibration | None, laser_only: bool, level_flo
     return Survey(url, opened, made, np.array(wanted, np.intp))
 
 
-def _size_problems(url: str, opened: OpenedMission, start: Calibration) -> list[Problem]:
+def _size_problems(url: str, opened: OpenedMission, start: Calibration, where: str) -> list[Problem]:
     own, given = ((c.camera.width, c.camera.height) for c in (opened.calibration, start))
     if own == given:
         return []
     found, expected = "x".join(map(str, given)), "{}x{}, as the images of {}".format(*own, url)
     remedy = "Start from a calibration of this camera at this image size."
-    return [Problem("--start", None, "camera", found, expected, remedy)]
+    return [Problem(where, None, "camera", found, expected, remedy)]
 
 
 def spread(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:

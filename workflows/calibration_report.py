@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ..schemas.calibration import Calibration
+from ..schemas.calibration import DISTORTION, Calibration
 from ..tasks.calibration_refraction import PinholeError
 from ..tasks.calibration_sheets import Sensitivity
 from .report import template
@@ -175,7 +175,7 @@ def picture(title: str, figure: Figure, caption: str) -> Figured:
 def camera_rows(calibration: Calibration, sigma: dict[str, float]) -> list[Row]:
     """Rows of the camera's numbers, sigma by name."""
     camera = calibration.camera
-    names = ("k1", "k2", "k3", "k4") if camera.model == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
+    names = DISTORTION[camera.model]
     value = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
     value |= dict(zip(names, camera.distortion, strict=False))
     return [Row(f"camera {k}", "px" if k in ("fx", "fy", "cx", "cy") else "", value[k], s) for k, s in sigma.items()]

@@ -86,7 +86,10 @@ def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
     warped = [dense.warp(made, seen, *of, scale) for seen, of in zip(sights, pixels, strict=True)]
     found = dense_refine.refine(dense.disparity(made, *warped), *warped)
     relief = dense.points(made, found, *sights)
-    to_map = m.frame.map_from_local
+
+    def to_map(X_local: np.ndarray) -> np.ndarray:
+        return m.frame.map_around(X_local, poses.C_local[i])
+
     cells = dense_cells.reduce_to_cells(
         to_map(relief.X_local), relief.metres_per_px, relief.noise_px, to_map(known), m.cell_m
     )
@@ -131,10 +134,10 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
     def make() -> Made:
         dense_off, tie_off = [dense_cells.NO_DIFFERENCES], [dense_cells.NO_DIFFERENCES]
         for pair, key, around in pairs:
-            to_map, within = m.frame.map_from_local, _WITHIN_CELLS * m.cell_m
-            lit = [to_map(sounded(m, image, solution)) for image in around]
+            near, within = solution.poses.C_local[pair.i.row], _WITHIN_CELLS * m.cell_m
+            lit = [m.frame.map_around(sounded(m, image, solution), near) for image in around]
             ties = _ties(m, pair, solution)
-            there = to_map(ties.X_local)
+            there = m.frame.map_around(ties.X_local, near)
             tie_off.append(dense_cells.differences(there, ties.metres_per_px, np.concatenate(lit), within))
             if key:
                 cells = read_cells(m, key)

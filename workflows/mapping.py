@@ -92,10 +92,12 @@ def _outlines(state: Session, solution: Solution, ranges: np.ndarray) -> np.ndar
 
 
 class _Footprints:
-    """Images, found by where their footprints, grown by a margin for relief, touch the map."""
+    """Images, found by where their footprints touch the map, grown by a margin for relief and each by moved_m (n,)."""
 
-    def __init__(self, outlines: np.ndarray, images: Sequence[Image]):
+    def __init__(self, outlines: np.ndarray, images: Sequence[Image], moved_m: Sequence[float] = ()):
         corners, margin_m = outlines[[image.row for image in images]], _margin(outlines, images)
+        if len(moved_m):
+            margin_m = margin_m + np.asarray(moved_m)[:, None]
         self._images, self._low, self._high = images, corners.min(1) - margin_m, corners.max(1) + margin_m
 
     def touching(self, grid: Grid) -> tuple[Image, ...]:
@@ -148,9 +150,10 @@ class _Pairs:
             self._of.setdefault(pair.j, []).append(k)
 
     def images(self, images: Sequence[Image]) -> tuple[Pair, ...]:
-        """Those of any of some images, in their order."""
-        found = {k for image in images for k in self._of.get(image.row, ())}
-        return tuple(self._linked[k] for k in sorted(found))
+        """Those of two of some images, in their order."""
+        rows = {image.row for image in images}
+        found = {k for row in rows for k in self._of.get(row, ())}
+        return tuple(pair for pair in (self._linked[k] for k in sorted(found)) if {pair.i, pair.j} <= rows)
 
 
 def _dense(
@@ -313,7 +316,7 @@ def _mosaics(
         state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name=state.key("align"))]
     )
     tiles = list(grids.tiles(grid, state.job.parameters.mosaic.tile_cells))
-    footprints, placed, tasks = _Footprints(outlines, shown), _Placed(ground.tiles), []
+    footprints, placed, tasks = _Footprints(outlines, shown, aligned.info["moved_m"]), _Placed(ground.tiles), []
     for k, tile in enumerate(tiles):
         described = Tile(tile, footprints.touching(tile))
         around = maps.ground_around(tile, ground.grid.cell_m, m.max_interpolation_m)

@@ -43,9 +43,11 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
         soundings = Soundings._make(np.concatenate(column) for column in zip(_NOTHING, *parts, strict=True))
         cells = gridding.grid_soundings(tile.grid, soundings)
         cells = cells._replace(sigma=np.hypot(cells.sigma, np.sqrt(_BEND) * said[-1]))
-        return Made(cells._asdict(), {"sounded": int((cells.density > 0).sum())})
+        at = np.flatnonzero(cells.density)
+        sounded = {name: values.ravel()[at] for name, values in cells._asdict().items()}
+        return Made({"cell": at.astype(np.int32), **sounded}, {"sounded": len(at)})
 
-    return once(m.job, CELLS, _VERSION, inputs, [context(m, tile), said], make, compress=True)
+    return once(m.job, CELLS, _VERSION, inputs, [context(m, tile), said], make)
 
 
 def relative(solution: Solution, measured_m: float) -> Solution:
@@ -96,13 +98,13 @@ def _laser(m: MapJob, image: Image, solution: Solution) -> Soundings:
     X_camera = arrays.get("laser_X", np.zeros((0, 3)))
     lean = np.hypot(X_camera[:, 0], X_camera[:, 1]) * solution.sigma_tilt_rad[image.row]
     shared = np.hypot(solution.sigma_m[image.row, 2], lean)
-    X = m.frame.map_from_local(dense.sounded(m, image, solution))
+    X = m.frame.map_around(dense.sounded(m, image, solution), solution.poses.C_local[image.row])
     return _soundings(X, arrays.get("laser_sigma", np.zeros(0)), LASER, image.row, shared)
 
 
 def _matched(m: MapJob, pair: Pair, solution: Solution, tie_px: float) -> Soundings:
     points = dense.tie_points(m, pair, solution, tie_px)
-    X = m.frame.map_from_local(points.X_local)
+    X = m.frame.map_around(points.X_local, solution.poses.C_local[pair.i])
     return _soundings(X, points.sigma_m, MATCHING, pair.i, points.common_sigma_m)
 
 
@@ -139,7 +141,7 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
         sigma = [np.zeros(0)]
         for sample, halo, known in zip(samples, halos, cells, strict=True):
             inner = grids.window(halo, sample.tile)
-            found = surface.delaunay_surface(halo, known, m.max_interpolation_m, law)
+            found = surface.delaunay_surface(halo, known, m.max_interpolation_m, law, sample.tile)
             seen = surface.seen(sample.tile, sample.outlines)
             sigma.append(np.where(known.density[inner] > 0, 0.0, found.sigma[inner])[seen])
         worst = surface.worst_shown(np.concatenate(sigma), m.least_seen, m.max_sigma_m)
@@ -163,7 +165,7 @@ def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]],
     def make() -> Made:
         halo = _halo(m, tile)
         cells = _cells(m.job, halo, neighbours)
-        found = surface.delaunay_surface(halo, cells, m.max_interpolation_m, law)
+        found = surface.delaunay_surface(halo, cells, m.max_interpolation_m, law, tile)
         mapped = surface.without_guesses(found, worst)
         inner = grids.window(halo, tile)
         layers = {
@@ -192,9 +194,12 @@ def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]]) -> Cells:
         y=np.full(grid.shape, np.nan),
     )
     for tile, done in tiles:
-        entry = load(job, CELLS, done.key)
+        arrays = load(job, CELLS, done.key).arrays
+        row, column = np.divmod(arrays["cell"], tile.width)
+        row, column = row + grid.top - tile.top, column + tile.left - grid.left
+        here = (row >= 0) & (row < grid.height) & (column >= 0) & (column < grid.width)
         for name, values in empty._asdict().items():
-            paste(grid, values, tile, entry.arrays[name])
+            values[row[here], column[here]] = arrays[name][here]
     return smooth.matched(grid, empty)
 
 

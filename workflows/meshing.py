@@ -250,6 +250,8 @@ def _with_steep_faces(
     """Nodes, heights, triangles, uv and texture with steep faces cut out of images; their vertices are there twice."""
     m, images = steep.m, {image.row: image for image in steep.images}
     X_map = vertex_positions(place, made.nodes, made.z, m.cell_m)
+    if not steep_faces.any_steep(X_map, made.triangles):
+        return made.nodes, made.z, made.triangles, uv, ortho
     model = mosaics.light_model(m.job, steep.light)
     lens = m.job.calibration.camera
     views = []

@@ -60,7 +60,7 @@ def _context(m: MapJob, tile: Tile) -> list[Any]:
 
 
 def align_planar(m: MapJob, images: Sequence[Image], linked: Sequence[Pair]) -> Done:
-    """Similarities of all images on the plane of the planar-scene hypothesis."""
+    """Similarities of all images on the plane of the planar-scene hypothesis; the info has how far each was moved."""
     solution = solve.solution(m.job, m.adjusted)
     whole = Tile(Grid(1.0, 0, 0, 1, 1), tuple(images), tuple(linked))
     inputs = [*_inputs(whole, solution), *(f"{pair.i}-{pair.j}:{pair.key}" for pair in linked)]
@@ -68,14 +68,16 @@ def align_planar(m: MapJob, images: Sequence[Image], linked: Sequence[Pair]) -> 
     def make() -> Made:
         rows = np.array([image.row for image in images], int)
         if not len(rows):
-            return Made({"rows": rows, "similarity": np.zeros((0, 2, 3))}, {})
+            return Made({"rows": rows, "similarity": np.zeros((0, 2, 3))}, {"moved_m": []})
         C_map = m.frame.map_from_local(solution.poses.C_local[rows])
         above = np.array([image.range_m for image in images])
-        height, seabed = float(np.median(above)), float(np.median(C_map[:, 2] - above))
+        height = float(np.median(above))
         R_map_local = np.eye(3) if m.frame.crs is None else m.frame.R_map_local(C_map.mean(0))
-        believed = planar.prior(C_map, np.maximum(C_map[:, 2] - seabed, 0.1), R_map_local)
+        believed = planar.prior(C_map, np.maximum(above, 0.1), R_map_local)
         matches = _levelled(m, linked, solution.poses, {int(row): k for k, row in enumerate(rows)}, height)
-        return Made({"rows": rows, "similarity": planar.align(believed, matches, 0.1 * height)}, {})
+        similarity = planar.align(believed, matches, 0.1 * height)
+        moved_m = np.hypot(*(similarity[:, :, 2] - C_map[:, :2]).T)
+        return Made({"rows": rows, "similarity": similarity}, {"moved_m": np.round(moved_m, 3).tolist()})
 
     context = [*_context(m, whole), [image.range_m for image in images]]
     return once(m.job, ALIGN, _VERSION, inputs, context, make)
@@ -185,7 +187,9 @@ def light_model(job: Job, light: Done | None) -> water.Water | None:
         return None
     a = load(job, LIGHTING, light.key).arrays
     scalars = {name: a[name].item() for name in ("spreading", "range_m")}
-    return water.Water(light=a["light"], attenuation=a["attenuation"], veil=a["veil"], balance=a["balance"], **scalars)
+    # in single precision, as the pixels are
+    attenuation, veil, balance = (a[name].astype(np.float32) for name in ("attenuation", "veil", "balance"))
+    return water.Water(light=a["light"], attenuation=attenuation, veil=veil, balance=balance, **scalars)
 
 
 def _thumbnail(job: Job, image: Image, poses: Poses, model: water.Water) -> np.ndarray:

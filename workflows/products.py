@@ -277,7 +277,7 @@ def _write_soundings(results: Results, folder: Path, crs_wkt: str) -> None:
             X = arrays["laser_X"] @ poses.R_local_camera[row].T + poses.C_local[row]
             frame = np.full(len(X), row, np.int32)
             sigma = np.hypot(arrays["laser_sigma"], calibration_quality.soundings_sigma(error, dict(arrays)))
-            file.write(results.plan.frame.map_from_local(X), frame, arrays["laser_arm"], sigma)
+            file.write(results.plan.frame.map_around(X, poses.C_local[row]), frame, arrays["laser_arm"], sigma)
 
 
 def _write_survey(results: Results, folder: Path, crs_wkt: str, rows: Sequence[trajectories.Row]) -> None:

@@ -268,3 +268,23 @@ def test_file_and_command_line_are_checked_together() -> None:
     assert "Did you mean grid.cell_m or mosaic.cell_m?" in remedies
     with pytest.raises(InvalidInput, match="a mapping"):
         load_parameters("- 1", "p.yaml")
+
+
+@pytest.mark.parametrize(
+    ("names", "matrix", "key", "found"),
+    [
+        ("camera.fx, camera.fx", "[[1, 0], [0, 1]]", "parameters", "twice"),
+        ("camera.fx, camera.fy", "[[1, 0], [0, -1]]", "matrix", "-1 as variance of camera.fy"),
+        ("camera.fx, camera.fy", "[[1, 0.5], [0.4, 1]]", "matrix", "0.4 in row 2"),
+    ],
+)
+def test_covariance_has_to_be_one(names: str, matrix: str, key: str, found: str) -> None:
+    text = with_line(CALIBRATION, f"covariance: [{{parameters: [{names}], matrix: {matrix}}}]")
+    assert found in problems(text, Calibration)[f"covariance.0.{key}"].found
+
+
+def test_sheets_are_two_and_lean() -> None:
+    twice = with_line(CALIBRATION, f"{LASER}[{PLANE}, {{name: a, normal: [-0.6, 0.8, 0], offset: 1}}]")
+    assert "named a" in problems(twice, Calibration)["laser.planes"].found
+    plus = with_line(CALIBRATION, LASER + "{baseline: 1.2, angle: 25, roll: 90}")
+    assert "90 degrees" in problems(plus, Calibration)["laser.planes.roll"].found

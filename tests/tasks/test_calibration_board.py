@@ -6,6 +6,7 @@ from seamosaic.tasks import board_shape, corner_fit
 from seamosaic.tasks import calibration_board as board
 from seamosaic.tasks import calibration_board_start as start
 from seamosaic.tasks import calibration_targets as targets
+from seamosaic.tasks.calibration_lines import Area
 from seamosaic.tasks.calibration_sheets import angle_deg
 from seamosaic.tasks.camera import project
 
@@ -200,13 +201,26 @@ def test_finds_corners_and_numbers_lines_from_the_left():
     assert found is not None
     assert found[0].shape == (42, 3)
     assert found[0].max() == pytest.approx(0.06)
-    light = targets.parallel_lines(image, targets.outline(found[1], 0.25), 3, LaserParameters())
+    light = targets.parallel_lines(image, Area(targets.outline(found[1], 0.25), beside=True), 3, LaserParameters())
     for s, (top, bottom) in enumerate(lines):
         own = light.uv[light.sheet == s]
         assert len(own) > 100
         expected = top + (bottom - top) * own[:, 1] / 499
         assert np.median(np.abs(own[:, 0] - expected)) < 0.3
-    assert not len(targets.parallel_lines(image, targets.outline(found[1], 0.25), 6, LaserParameters()).uv)
+    assert not len(
+        targets.parallel_lines(image, Area(targets.outline(found[1], 0.25), beside=True), 6, LaserParameters()).uv
+    )
+
+
+def test_light_off_the_board_is_not_taken_for_light_on_it():
+    """What is behind the board carries more of each line than the board does."""
+    image = picture([(560, 540), (250, 246), (690, 678)])
+    found = targets.corners(targets.without_light(image), targets.Board("chessboard", 7, 6, 0.01))
+    assert found is not None
+    light = targets.parallel_lines(image, Area(targets.outline(found[1], 0.0)), 1, LaserParameters())
+    assert len(light.uv) > 100
+    assert np.abs(light.uv[:, 0] - 248).max() < 4
+    assert (np.ptp(light.uv[:, 1]) < np.ptp(found[1][:, 1])).all()
 
 
 def test_charuco_board_is_found():

@@ -13,7 +13,7 @@ from seamosaic.schemas.parameters import LaserParameters
 from seamosaic.tasks import calibration_board as board
 from seamosaic.tasks import calibration_board_start as start
 from seamosaic.tasks import calibration_targets as targets
-from seamosaic.tasks.calibration_lines import averaged
+from seamosaic.tasks.calibration_lines import Area, averaged
 from seamosaic.tasks.calibration_sheets import angle_deg, cast_rays
 from seamosaic.tasks.camera import rays
 
@@ -33,7 +33,9 @@ def observed(pattern: str, target: targets.Board, lines: int, grow: float):
         found = targets.corners(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8), target)
         assert found is not None
         corners.append(found)
-        light.append(targets.parallel_lines(image, targets.outline(found[1], grow), lines, LaserParameters()))
+        light.append(
+            targets.parallel_lines(image, Area(targets.outline(found[1], grow), beside=True), lines, LaserParameters())
+        )
         size = (image.shape[1], image.shape[0])
     parts = [averaged(*one) for one in light]
     number = np.arange(len(corners))

@@ -63,3 +63,16 @@ def test_without_navigation_the_map_is_the_local_frame():
 def test_frames_travel_to_workers():
     X = np.array([[1.0, 2, 3]])
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(EDGE)).map_from_local(X), EDGE.map_from_local(X))
+
+
+@pytest.mark.parametrize(("crs", "latitude", "longitude"), [("EPSG:32631", 43.04, 6.01), ("EPSG:3031", -77.0, 166.0)])
+def test_around_a_place_the_map_is_good_to_micrometres(crs, latitude, longitude):
+    frame = MapFrame(crs, latitude, longitude)
+    near = np.array([320.0, -150.0, -40.0])
+    X = near + np.random.default_rng(0).uniform(-10, 10, (200, 3))
+    off = frame.map_around(X, near) - frame.map_from_local(X)
+    assert 0 < np.abs(off).max() < 2e-5
+    inner = np.abs(X - near).max(1) < 3
+    assert np.abs(off[inner]).max() < 3e-6
+    np.testing.assert_array_equal(MapFrame(None).map_around(X, near), X)
+    assert frame.map_around(X[:0], near).shape == (0, 3)

@@ -204,6 +204,21 @@ def test_holes_in_the_surface_and_images_elsewhere_leave_nothing():
     assert not nothing.mask.any()
 
 
+def test_a_tile_that_is_mostly_above_the_camera():
+    """Beside a cliff: what the image sees decides, not the ground behind and above it."""
+
+    def cliff(x, y):
+        return np.where(x < -0.35, -3.0, 5.0) + 0 * y
+
+    view = photograph(*pose(-0.6, 0.0, 0.0), flat, 0)
+    result = compose(TILE, terrain_of(cliff), [view])
+    x, _ = grids.cell_centres(TILE)
+    assert 0.1 < result.mask.mean() < 0.4
+    assert not result.mask[x > -0.3].any()
+    above = terrain_of(lambda x, y: 5.0 + 0 * x)
+    assert not compose(TILE, above, [view]).mask.any()
+
+
 def test_an_image_with_the_horizon_serves_below_it():
     R, C = pose(0.0, -1.5, -1.0, 0, 0, 45)
     view = photograph(R, C, -2.0, 0)

@@ -207,3 +207,18 @@ def test_a_long_tail_widens_the_growth_halfway():
     assert 1.1 < other.scale_m / one.scale_m < 1.6
     within = np.mean(np.abs(scale * heavy) < 2 * surface.growth_sigma(other, distance, spread))
     assert 0.92 < within < 0.98
+
+
+def test_what_is_not_counted_is_left_out_of_the_work_only():
+    rng = np.random.default_rng(2)
+    relief = lambda x, y: -10 + 0.2 * np.sin(3 * x) * np.cos(2 * y)  # noqa: E731
+    X, Y = grids.cell_centres(GRID)
+    dense = rng.permutation(X.size)[: X.size // 2]
+    xy = np.column_stack([X.ravel(), Y.ravel()])[dense]
+    cells = gridded(np.concatenate([lines(rng, relief), np.column_stack([xy, relief(*xy.T)])]))
+    part = Grid(GRID.cell_m, GRID.left + 31, GRID.top - 20, 50, 44)
+    whole, some = (surface.delaunay_surface(GRID, cells, 0.5, GROWTH, counted) for counted in (None, part))
+    inner = grids.window(GRID, part)
+    for a, b in zip(whole, some, strict=True):
+        np.testing.assert_array_equal(a[inner], b[inner])
+    assert np.isfinite(whole.elevation).sum() > np.isfinite(some.elevation).sum()

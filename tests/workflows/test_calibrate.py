@@ -100,6 +100,22 @@ def test_an_output_that_is_a_file_is_refused_before_any_work(tmp_path: Path):
         CliRunner().invoke(app, arguments, catch_exceptions=False)
 
 
+def test_an_output_elsewhere_is_refused_before_any_work(tmp_path: Path):
+    for out, expected in (("s3://maps/new", "expected a local folder"), (tmp_path / "file" / "out", "can be written")):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(InvalidInput, match=expected):
+            CliRunner().invoke(
+                app, ["calibrate", "board", str(tmp_path), "-o", str(out), *BOARD], catch_exceptions=False
+            )
+
+
+def test_boards_that_cannot_tell_what_is_asked_are_refused(tmp_path: Path):
+    arguments = ["calibrate", "board", str(tmp_path), "-o", str(tmp_path / "out"), *BOARD]
+    for more, expected in ((["--hold-camera"], "no --start"), (["--bent", "--rows", "7"], "the same upside down")):
+        with pytest.raises(InvalidInput, match=expected):
+            CliRunner().invoke(app, [*arguments, *more], catch_exceptions=False)
+
+
 def test_a_start_of_another_image_size_is_refused(tiny_mission: Path, tmp_path: Path):
     content = yaml.safe_load((tiny_mission / "calibration.yaml").read_text())
     content["camera"]["width"] += 2
@@ -140,6 +156,15 @@ def test_board(tmp_path: Path):
     assert 0.0001 < stated < 0.004
     assert abs(off["after"].mean()) < 3 * stated
     assert np.abs(off["before"]).max() > 2 * np.abs(off["after"]).max()
+    assert not any(name.endswith("k3") for name in block.parameters)  # held, so nothing was learnt of it
+    again = tmp_path / "again"
+    held = [*arguments[:3], "--hold-camera", "--start", str(out / "calibration.yaml"), "-o", str(again)]
+    assert CliRunner().invoke(app, [*held, "--columns", "9", "--rows", "6", "--square-mm", "60"]).exit_code == 0
+    camera, sheets = read_calibration(again / "calibration.yaml").covariance
+    count = len(block.parameters) - 8
+    assert camera.parameters == block.parameters[:count]
+    assert camera.matrix == tuple(row[:count] for row in block.matrix[:count])
+    assert sheets.parameters == block.parameters[count:]
     page = (out / "calibration-report.html").read_text()
     assert "Left-out light" in page
     assert page.count("data:image/png") == 3

@@ -31,7 +31,7 @@ def test_what_is_found_by_place_is_what_lies_there(seed: int, count: int):
     linked = [Pair(3 * i, 3 * j, f"{i}-{j}") for i in range(count) for j in range(i + 1, count) if rng.random() < 0.3]
     some = [one for one in images if rng.random() < 0.4]
     rows = {one.row for one in some}
-    expected = tuple(pair for pair in linked if pair.i in rows or pair.j in rows)
+    expected = tuple(pair for pair in linked if pair.i in rows and pair.j in rows)
     assert mapping._Pairs(linked).images(some) == expected
 
 
@@ -46,6 +46,9 @@ def test_images_are_found_where_their_footprints_with_a_margin_touch():
     assert footprints.touching(Grid(0.1, 20, 20, 5, 5)) == (images[0],)
     assert footprints.touching(Grid(0.1, round(10 * (2 + margin)) + 1, 20, 5, 5)) == ()
     assert footprints.touching(Grid(1.0, -5, 10, 40, 20)) == tuple(images)
+    moved = mapping._Footprints(outlines, images, [0.0, 3.0])
+    assert moved.touching(Grid(1.0, 17, 2, 1, 1)) == (images[1],)
+    assert moved.touching(Grid(1.0, 3, 2, 2, 2)) == ()
     assert mapping._Footprints(outlines, []).touching(Grid(1.0, -5, 10, 40, 20)) == ()
 
 
