@@ -187,7 +187,7 @@ def _orthomosaic(m: MapJob, own: Grid, wanted: Grid, pictures: Sequence[tuple[Gr
         shared = grids.intersection(wanted, grid)
         if shared is None:
             continue
-        arrays = load(m.job, mosaics.MOSAIC, done.key, ("rgb", "mask")).arrays
+        arrays = mosaics.layers(m.job, grid, done, ("rgb", "mask"))
         at, part = grids.window(wanted, shared), grids.window(grid, shared)
         rgb[at], mask[at] = (
             cv2.merge([np.ascontiguousarray(band) for band in arrays["rgb"][:, *part]]),

@@ -1,7 +1,7 @@
 """Orthomosaic and planar mosaic, per map tile: both from images that are read once, and the light of the mission."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -25,6 +25,7 @@ from .solve import Solution
 _ALIGNED_MATCHES = 50
 LIGHTING, ALIGN, MOSAIC = "lighting", "planar-align", "mosaic"
 _VERSION = code_version(sys.modules[__name__])
+_MASKS = "mask", "painted", "planar_mask"  # stored as bits, of rows
 _REMEMBERED = 64  # images, of which 0.2 MB each
 
 
@@ -124,10 +125,20 @@ def mosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], alig
         cv2.setNumThreads(1)
         ortho, flat = mosaic.compose(plans, pixels, times, m.job.parameters.mosaic.gamma if light else 1.0)
         arrays = {**ortho._asdict(), "planar_rgb": flat.rgb, "planar_mask": flat.mask}
+        arrays |= {name: np.packbits(arrays[name], axis=1) for name in _MASKS}
         return Made(arrays, {"pixels": int(ortho.mask.sum()), "painted": int(ortho.painted.sum())})
 
     parameters = [*_context(m, tile), sorted(times.items())]
-    return once(m.job, MOSAIC, _VERSION, inputs, parameters, make, ("mask", "source", "painted", "planar_mask"))
+    return once(m.job, MOSAIC, _VERSION, inputs, parameters, make, ("source", *_MASKS))
+
+
+def layers(job: Job, tile: Grid, done: Done, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Some of the arrays of a tile: rgb, planar_rgb (3, height, width) and mask, planar_mask, painted, source."""
+    arrays = load(job, MOSAIC, done.key, names).arrays
+    return {
+        name: np.unpackbits(values, axis=1, count=tile.width).view(bool) if name in _MASKS else values
+        for name, values in arrays.items()
+    }
 
 
 def _on_surface(

@@ -243,7 +243,7 @@ def _write_mosaic(results: Results, folder: Path, crs_wkt: str) -> None:
         _writer(folder, "mosaic-painted.tif", mosaic.grid, crs_wkt, tags) as painted,
     ):
         for tile, done in mosaic.tiles:
-            arrays = load(job, mosaics.MOSAIC, done.key, ("rgb", "mask", "source", "painted")).arrays
+            arrays = mosaics.layers(job, tile, done, ("rgb", "mask", "source", "painted"))
             place = _inner(mosaic.grid, tile)
             colours.write(*place, arrays["rgb"], arrays["mask"])
             sources.write(*place, arrays["source"])
@@ -254,7 +254,7 @@ def _write_planar(results: Results, folder: Path, crs_wkt: str) -> None:
     mosaic, tags = results.mapped.mosaic, {"MISSION": results.opened.mission.id}
     with _writer(folder, "mosaic-planar.tif", mosaic.grid, crs_wkt, tags) as planar:
         for tile, done in mosaic.tiles:
-            arrays = load(results.job, mosaics.MOSAIC, done.key, ("planar_rgb", "planar_mask")).arrays
+            arrays = mosaics.layers(results.job, tile, done, ("planar_rgb", "planar_mask"))
             planar.write(*_inner(mosaic.grid, tile), arrays["planar_rgb"], arrays["planar_mask"])
 
 
