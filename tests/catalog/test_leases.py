@@ -41,6 +41,7 @@ def test_one_holds_it_and_gives_it_back(out):
     assert not lease.lost.is_set()
 
 
+@pytest.mark.parametrize("out", ["local", "s3"], indirect=True)  # fsspec's memory is not made for threads
 def test_of_many_that_take_it_at_once_one_has_it(out):
     together, inside, most = threading.Barrier(8), [], []
 
@@ -62,6 +63,7 @@ def test_of_many_that_take_it_at_once_one_has_it(out):
     assert max(most) == 1
 
 
+@pytest.mark.parametrize("out", ["local", "s3"], indirect=True)  # fsspec's memory is not made for threads
 def test_of_many_that_find_a_lapsed_one_one_has_it(out):
     for turn in range(10):
         dead = leases.take(out, "reef", term_s=0.05)  # never entered, so never renewed
