@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from ..schemas.parameters import AdjustParameters
 from . import tree_covariances
 from .factors import (
+    camera_pose,
     datum,
     elimination_order,
     first_values,
@@ -118,7 +119,7 @@ def adjust(
     )
 
 
-def tells_anew(links: list[Link], poses: Poses, status: Sequence[str], navigation: NavigationPrior) -> bool:
+def would_change(links: list[Link], poses: Poses, status: Sequence[str], navigation: NavigationPrior) -> bool:
     """Whether links that came after the adjustment would change it.
 
     They would where they join images that only navigation places, more than a few of them, or where most of an image's,
@@ -133,7 +134,7 @@ def tells_anew(links: list[Link], poses: Poses, status: Sequence[str], navigatio
         return True
     told, contradicting = np.zeros((2, len(status)), int)
     for link in links:
-        between = _placed(poses, link.i).between(_placed(poses, link.j))
+        between = camera_pose(poses, link.i).between(camera_pose(poses, link.j))
         told[[link.i, link.j]] += 1
         contradicting[[link.i, link.j]] += not _consistent(_scaled_by_navigation(link, adjusted).motion, between)
     return bool(((contradicting > 1) & (2 * contradicting > told)).any())
@@ -241,10 +242,6 @@ def _solve(graph: Any, links: list[Link], start: Poses, threshold: float) -> Any
 def _agrees(link: Link, values: Any) -> bool:
     """Whether the solution is within six sigma of a link's motion."""
     return _consistent(link.motion, values.atPose3(link.i).between(values.atPose3(link.j)))
-
-
-def _placed(poses: Poses, k: int) -> Any:
-    return pose(poses.R_local_camera[k], poses.C_local[k])
 
 
 def _consistent(motion: Motion, between: Any) -> bool:

@@ -24,11 +24,16 @@ def pose(R: Array, C: Array) -> Any:
     return gtsam.Pose3(gtsam.Rot3(R), np.asarray(C, float))
 
 
+def camera_pose(poses: Poses, k: int) -> Any:
+    """A gtsam.Pose3 of camera k."""
+    return pose(poses.R_local_camera[k], poses.C_local[k])
+
+
 def datum(start: Poses, first: int) -> Any:
     """Image `first` held where it is."""
     graph = gtsam.NonlinearFactorGraph()
     noise = gtsam.noiseModel.Isotropic.Sigma(6, _DATUM_SIGMA)
-    graph.add(gtsam.PriorFactorPose3(first, pose(start.R_local_camera[first], start.C_local[first]), noise))
+    graph.add(gtsam.PriorFactorPose3(first, camera_pose(start, first), noise))
     return graph
 
 
@@ -36,7 +41,7 @@ def first_values(graph: Any, start: Poses) -> Any:
     """Values of the cameras that have a pose, and of navigation's variables that the graph has, to start from."""
     values, wanted = gtsam.Values(), set(graph.keyVector())
     for k in np.flatnonzero(start.known).tolist():
-        place = pose(start.R_local_camera[k], start.C_local[k])
+        place = camera_pose(start, k)
         values.insert(k, place)
         if of_navigation(k) in wanted:
             values.insert(of_navigation(k), place)
@@ -77,7 +82,7 @@ def navigation_factors(navigation: NavigationPrior) -> Any:
     known = np.flatnonzero(poses.known).tolist()
     count = len(known)
     for k in known:
-        R, own = poses.R_local_camera[k], pose(poses.R_local_camera[k], poses.C_local[k])
+        R, own = poses.R_local_camera[k], camera_pose(poses, k)
         offset, bias = (s[k] * np.sqrt(count) for s in (navigation.sigma_horizontal, navigation.sigma_depth))
         graph.add(gtsam.PriorFactorPose3(of_navigation(k), own, _noise(_EXACT_RAD, R, offset, bias)))
         attitude = _attitude(navigation, k, count)

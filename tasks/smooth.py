@@ -42,13 +42,13 @@ class _Moments(NamedTuple):
 
 
 class _Around(NamedTuple):
-    """All cells with a rim of unknown ones, flat, in rows of `width`: x, y from their centres, cells; z; weights."""
+    """All cells with a rim of unknown ones, flat, in rows of `width`: x, y from their centres, cells; weights; z."""
 
     width: int
     x: Array
     y: Array
-    z: Array
     weight: Array
+    z: Array
 
 
 class _Found(NamedTuple):
@@ -73,8 +73,9 @@ def matched(grid: Grid, cells: Cells) -> Cells:
     z = np.where(cells.source == MATCHING, _without_spikes(cells.elevation), cells.elevation)
     weight = np.where(cells.density > 0, (_NOISE_M / np.maximum(cells.noise, 1e-5)) ** 2, 0.0)
     rim = _RADII[-1]
-    layers = (np.pad(np.nan_to_num(values), rim).ravel() for values in (x, y, z, weight))
-    around = _Around(grid.width + 2 * rim, *(v if k == 2 else v.astype(np.float32) for k, v in enumerate(layers)))
+    u, v, w, heights = (np.pad(np.nan_to_num(values), rim).ravel() for values in (x, y, weight, z))
+    u, v, w = (values.astype(np.float32) for values in (u, v, w))
+    around = _Around(grid.width + 2 * rim, u, v, w, heights)
     here = (wanted // grid.width + rim) * around.width + wanted % grid.width + rim
     parts = [_smoothed(around, here[k : k + _TOGETHER]) for k in range(0, len(here), _TOGETHER)]
     found = _Found(*(np.concatenate(column) for column in zip(*parts, strict=True)))

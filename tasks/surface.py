@@ -123,10 +123,14 @@ def _circumradius(xy: Array) -> Array:
         return sides[0] * sides[1] * sides[2] / (2 * area)
 
 
+def _in_cells(grid: Grid, xy: Array) -> tuple[Array, Array]:
+    """Column and row of map positions (..., 2), whole at the cells' centres."""
+    return xy[..., 0] / grid.cell_m - grid.left - 0.5, grid.top - xy[..., 1] / grid.cell_m - 0.5
+
+
 def _rasterise(grid: Grid, xy: Array) -> NDArray[np.int64]:
     """Number of the triangle (of (T, 3, 2) map metres) over each cell's centre, (height * width,), -1 none."""
-    x = xy[..., 0] / grid.cell_m - grid.left - 0.5
-    y = grid.top - xy[..., 1] / grid.cell_m - 0.5
+    x, y = _in_cells(grid, xy)
     first = np.maximum(np.ceil(y.min(1)), 0).astype(np.int64)
     rows = np.maximum(np.minimum(np.ceil(y.max(1)), grid.height).astype(np.int64) - first, 0)
     triangle, row = _runs(first, rows)
@@ -155,7 +159,7 @@ def _runs(first: NDArray[np.int64], length: NDArray[np.int64]) -> tuple[NDArray[
 
 def _around(grid: Grid, xy: Array, wanted: Mask) -> Mask:
     """Which triangles (T, 3, 2), map metres, may lie over a wanted cell."""
-    x, y = xy[..., 0] / grid.cell_m - grid.left - 0.5, grid.top - xy[..., 1] / grid.cell_m - 0.5
+    x, y = _in_cells(grid, xy)
     first, last = (
         (np.clip(np.ceil(at.min(1)), 0, size), np.clip(np.floor(at.max(1)) + 1, 0, size))
         for at, size in ((x, grid.width), (y, grid.height))
@@ -236,7 +240,7 @@ def without_guesses(surface: Surface, max_sigma_m: float) -> Surface:
 
 def seen(grid: Grid, outlines: Array) -> Mask:
     """Which cells (height, width) lie within an image's outline, (K, M, 2) map metres."""
-    x, y = outlines[..., 0] / grid.cell_m - grid.left - 0.5, grid.top - outlines[..., 1] / grid.cell_m - 0.5
+    x, y = _in_cells(grid, outlines)
     covered = np.zeros(grid.shape, np.uint8)
     for points in np.round(np.stack([x, y], -1)).astype(np.int32):
         cv2.fillConvexPoly(covered, cv2.convexHull(points), 1)

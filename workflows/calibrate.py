@@ -55,23 +55,18 @@ def prepare(out: Path) -> None:
     if (out / CALIBRATION).exists():
         remedy = "Choose another folder; calibrations are never overwritten."
         raise InvalidInput([Problem(str(out / CALIBRATION), None, "", "a calibration", "no such file yet", remedy)])
-    if out.exists() and not out.is_dir():
-        remedy = "Give --out a folder, which need not exist."
-        raise InvalidInput([Problem(str(out), None, "", "a file", "a folder", remedy)])
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        refused = None if os.access(out, os.W_OK) else "a folder that may not be written"
-    except OSError as error:
-        refused = error.strerror or str(error)
-    if refused:
-        remedy = "Choose another folder, or give yourself the right to write there."
-        raise InvalidInput([Problem(str(out), None, "", refused, "a folder that can be written", remedy)])
+    there = next(place for place in (out, *out.parents) if os.path.exists(place))
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        found = "a folder that may not be written" if there.is_dir() else "a file"
+        remedy = "Give --out a folder, which need not exist, where you may write."
+        raise InvalidInput([Problem(str(there), None, "", found, "a folder that can be written", remedy)])
 
 
 def write(out: Path, calibration: Calibration, page: report.Page) -> Written:
     """Write both files, each whole or not at all."""
     content = json.loads(calibration.model_dump_json(exclude_none=True))
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
+    out.mkdir(parents=True, exist_ok=True)
     paths = out / CALIBRATION, out / REPORT
     temporary = paths[0].with_name(f".{CALIBRATION}.{os.getpid()}")
     temporary.write_text(text, encoding="utf-8")

@@ -280,7 +280,7 @@ def _close_loops(
         matched = [pair for pair in matched if pair[:2] not in tried] + again
         linked = sum(bool(done.info["model"]) for _, _, done in again)
         log.info("mission=%s step=%s later_pairs=%d linked=%d", job.mission_id, match.STEP, len(again), linked)
-        if made.prior is not None and not solve.tells_anew(job, adjustments[-1], again, made.prior):
+        if made.prior is not None and not solve.would_change(job, adjustments[-1], again, made.prior):
             break
         adjustments += compute(state, "adjust", [_adjust_task(state, [matched], extracts, f"adjust-{turn}")])
     return matched

@@ -92,11 +92,11 @@ def _links(job: Job, linked: Sequence[tuple[int, int, Done]]) -> list[Link]:
     return [match.link(i, j, load(job, match.STEP, done.key)) for i, j, done in linked]
 
 
-def tells_anew(job: Job, made: Done, later: Sequence[tuple[int, int, Done]], prior: NavigationPrior) -> bool:
-    """Whether pairs matched after an adjustment would change it; see `tasks.adjust.tells_anew`."""
+def would_change(job: Job, made: Done, later: Sequence[tuple[int, int, Done]], prior: NavigationPrior) -> bool:
+    """Whether pairs matched after an adjustment would change it; see `tasks.adjust.would_change`."""
     found = solution(job, made.key)
     links = _links(job, [pair for pair in later if pair[2].info["model"]])
-    return adjust.tells_anew(links, found.poses, found.status, prior)
+    return adjust.would_change(links, found.poses, found.status, prior)
 
 
 def _bundle(

@@ -199,7 +199,7 @@ def test_later_links_tell_anew_what_they_contradict_or_join(metric):
     found = _run(poses, [link for link in links if link not in later], navigation)
 
     def anew(links, poses=found.poses, status=found.status):
-        return adjust.tells_anew(links, poses, status, navigation)
+        return adjust.would_change(links, poses, status, navigation)
 
     assert not anew(later)
     wrong = Link(3, 14, _motion(np.eye(3), np.array([0.4, 0.4, 0.0]) / (1 if metric else 0.566), metric))
