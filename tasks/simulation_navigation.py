@@ -27,7 +27,7 @@ _ALTIMETER_NOISE_M = 0.01
 
 
 class Plan(NamedTuple):
-    """A lawnmower pattern: parallel lines joined by half circles.
+    """A lawnmower pattern of the camera: parallel lines joined by half circles.
 
     Attributes
     ----------
@@ -36,6 +36,7 @@ class Plan(NamedTuple):
     spacing_m : distance of neighbouring lines, metres.
     lead_m : how far the vehicle sails straight before the first and after the last station of a line, metres.
     z_m : level of the reference point, local frame, metres.
+    camera_m : where the camera sits, forward and to starboard of the reference point, metres.
     image_time_s : (n,) exposures, seconds from the start of navigation.
     image_role : n roles, as mission.yaml names them.
     sway : (5, waves, 3) amplitude, radians per second and phase of what is added across, up, in roll, pitch, heading.
@@ -46,6 +47,7 @@ class Plan(NamedTuple):
     spacing_m: float
     lead_m: float
     z_m: float
+    camera_m: tuple[float, float]
     image_time_s: Array
     image_role: tuple[Role, ...]
     sway: Array
@@ -84,6 +86,7 @@ def plan(
     images: int,
     footprint_m: tuple[float, float],
     z_m: float,
+    camera_m: tuple[float, float],
     rng: np.random.Generator,
     period_m: float = 0.0,
 ) -> Plan:
@@ -95,6 +98,7 @@ def plan(
     images : exposures in all, shared out over the lines.
     footprint_m : an image's extent on the datum across and along the line, metres.
     z_m : level of the reference point, local frame, metres.
+    camera_m : where the camera sits, forward and to starboard of the reference point, metres.
     rng : draws the sway.
     period_m : distance after which stations and sway repeat themselves, along and across the lines; overlap and
         sidelap are changed a little to allow it. 0: never.
@@ -118,7 +122,7 @@ def plan(
         slowest = 2 * np.pi * survey.speed_m_s / period_m
         frequency = slowest * np.maximum(1, np.round(frequency / slowest))
     sway = np.stack([amplitude, frequency, rng.uniform(0, 2 * np.pi, size)], -1)
-    return Plan(survey, line, spacing, lead, z_m, time[:images], roles[:images], sway)
+    return Plan(survey, line, spacing, lead, z_m, camera_m, time[:images], roles[:images], sway)
 
 
 def _exposures(station_time_s: NDArray, survey: SurveyScene) -> tuple[NDArray, tuple[Role, ...]]:
@@ -144,8 +148,10 @@ def trajectory(plan: Plan, time_s: Array) -> States:
     forward = np.where(last, way, np.minimum(way, straight)) - straight / 2 + radius * np.sin(turn)
     there = np.where(line % 2 == 0, 1.0, -1.0)
     sway = _sway(plan, time_s)
-    along = there * forward
+    ahead, aside = plan.camera_m  # the reference point is that far behind the camera, and to its port
+    along = there * forward - ahead * there * np.cos(turn) + aside * np.sin(turn)
     across = (line - (survey.lines - 1) / 2) * plan.spacing_m + radius * (1 - np.cos(turn)) + sway[0]
+    across -= ahead * np.sin(turn) + aside * there * np.cos(turn)
     bow = np.radians(survey.heading_deg)
     X = np.column_stack(
         [

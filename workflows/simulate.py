@@ -180,8 +180,9 @@ def _make(scene: Scene, seed: int) -> _Made:
         altitude,
     )
     footprint = (float(slopes[1, 0] - slopes[0, 0]), float(slopes[3, 1] - slopes[2, 1]))
-    z = altitude - scene.terrain.depth_m + calibration.mount.translation[2]
-    made = plan(scene.survey, scene.images, footprint, z, _rng(seed, _MOTION), scene.period_m)
+    ahead, aside, down = calibration.mount.translation
+    z = altitude - scene.terrain.depth_m + down
+    made = plan(scene.survey, scene.images, footprint, z, (ahead, aside), _rng(seed, _MOTION), scene.period_m)
     poses = cameras(trajectory(made, made.image_time_s), calibration.mount)
     half_m = _half_m(scene, camera, _folded(scene, poses.C_local))
     terrain = make_terrain(scene.terrain, half_m, _rng(seed, _TERRAIN), scene.period_m)

@@ -47,8 +47,9 @@ def survey(name: str, seed: int, **changes) -> Survey:
     streams = [np.random.default_rng([seed, k]) for k in range(5)]
     x, y = np.abs(normalised(camera, outline(camera, 3), altitude)).max(0)
     footprint = 2 * altitude * x, 2 * altitude * y
-    z = altitude - scene.terrain.depth_m + calibration.mount.translation[2]
-    made = simulated.plan(scene.survey, scene.images, footprint, z, streams[0])
+    ahead, aside, down = calibration.mount.translation
+    z = altitude - scene.terrain.depth_m + down
+    made = simulated.plan(scene.survey, scene.images, footprint, z, (ahead, aside), streams[0])
     placed = simulated.cameras(simulated.trajectory(made, made.image_time_s), calibration.mount)
     true = Poses(*placed)
     half = float(np.abs(true.C_local[:, :2]).max() + 1.0 * altitude + 0.5)

@@ -10,14 +10,18 @@ FOOTPRINT_M = (2.0, 1.5)
 STEADY = SurveyScene(wobble=0.0)
 
 
-def make(survey: SurveyScene = STEADY, images: int = 12, seed: int = 0) -> sn.Plan:
-    return sn.plan(survey, images, FOOTPRINT_M, -12.0, np.random.default_rng(seed))
+ABOVE, MOUNT = Mount(), Mount(translation=(0.35, 0.12, 0.25))
 
 
-def test_lines_overlap_as_asked():
-    made = make()
+def make(survey: SurveyScene = STEADY, images: int = 12, seed: int = 0, mount: Mount = ABOVE) -> sn.Plan:
+    return sn.plan(survey, images, FOOTPRINT_M, -12.0, mount.translation[:2], np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("mount", [ABOVE, MOUNT])
+def test_the_cameras_lines_overlap_as_asked(mount):
+    made = make(mount=mount)
     states = sn.trajectory(made, made.image_time_s)
-    X, bow = states.X_local[:, :2], np.radians(STEADY.heading_deg)
+    X, bow = sn.cameras(states, mount).C_local[:, :2], np.radians(STEADY.heading_deg)
     along, across = X @ [np.sin(bow), np.cos(bow)], X @ [np.cos(bow), -np.sin(bow)]
     lines = np.unique(np.round(across, 6))
     assert np.diff(lines) == pytest.approx([2.0 * (1 - STEADY.sidelap)] * 2)
@@ -27,11 +31,12 @@ def test_lines_overlap_as_asked():
     assert (states.X_local[:, 2] == -12).all()
 
 
-def test_the_vehicle_sails_where_it_heads_at_constant_speed():
-    made = make()
+@pytest.mark.parametrize("mount", [ABOVE, MOUNT])
+def test_the_camera_sails_where_it_heads_at_constant_speed(mount):
+    made = make(mount=mount)
     t = np.linspace(0, made.image_time_s[-1] + sn.LEAD_S, 4001)
     states = sn.trajectory(made, t)
-    step = np.diff(states.X_local[:, :2], axis=0)
+    step = np.diff(sn.cameras(states, mount).C_local[:, :2], axis=0)
     assert np.linalg.norm(step, axis=1) / np.diff(t) == pytest.approx(np.full(4000, 0.3), rel=0.01)
     course = np.degrees(np.arctan2(step[:, 0], step[:, 1]))
     off = (course - (states.attitude_deg[1:, 2] + states.attitude_deg[:-1, 2]) / 2 + 180) % 180
@@ -68,7 +73,7 @@ def test_images_are_shared_out_over_lines():
 
 def test_the_camera_is_ahead_of_and_below_the_reference_point():
     states = sn.States(np.zeros(1), np.array([[1.0, 2.0, -5.0]]), np.array([[0.0, 0.0, 90.0]]))
-    pose = sn.cameras(states, Mount(translation=(0.35, 0.12, 0.25)))
+    pose = sn.cameras(states, MOUNT)
     # heading east: the bow is east, starboard is south
     assert pose.C_local[0] == pytest.approx([1.35, 1.88, -5.25])
     assert pose.R_local_camera[0] @ [0, 0, 1] == pytest.approx([0, 0, -1], abs=1e-12)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import s3fs
+from distributed import Client
 from seamosaic.catalog import versions
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.schemas.problems import InvalidInput
@@ -27,6 +28,8 @@ def workers(s3: S3, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         fleet.worker(address, folder / "one"),
         fleet.worker(address, folder / "two"),
     ):
+        with Client(address) as client:
+            client.wait_for_workers(2, fleet.PATIENCE_S)
         yield address
 
 
