@@ -6,6 +6,7 @@ terrain between soundings are measured on what the rounds before leave of them.
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import gtsam
@@ -17,9 +18,9 @@ from ..schemas.parameters import AdjustParameters
 from . import crossovers, laser_ranges
 from . import residuals as remaining
 from .adjust import Adjusted, sigmas
-from .camera import ground_sample_distance, normalised
+from .camera import focal_px, normalised
 from .crossovers import Crossovers, Lines
-from .factors import datum, first_values, navigation_factors
+from .factors import DOUBTFUL, datum, first_values, navigation_factors
 from .laser_ranges import Ranges
 from .navigation import NavigationPrior, Poses, with_half_turns
 from .reduction import Observations, State, covariances, observations, solve
@@ -41,6 +42,7 @@ _RANGE_GATE = 6.0  # sigmas
 _TOLD, _HOLDING = 3, 36
 _SLOPE_SIGMA = 0.03
 _MAD_TO_SIGMA = 1.4826
+_SHIFT_ROUNDS = 20
 
 
 class Block(NamedTuple):
@@ -95,11 +97,15 @@ def adjust(
         navigation = with_half_turns(navigation, chained.turned)
     try:
         found = refine(camera, chained.poses, sights, soundings, lines, navigation, p)
-        if found is None:
-            return chained
-        sigma_m, covariance_xy, sigma_tilt = sigmas(_covariances(found, navigation, p), found.poses, navigation)
     except RuntimeError:  # GTSAM: a system too near to singular, which counting alone cannot foresee
+        found = None
+    if found is None:
         return chained
+    sigma = chained.sigma_m, chained.covariance_xy_m2, chained.sigma_tilt_rad
+    with suppress(RuntimeError):  # too near to singular for covariances: those of the pair motions are larger
+        own = sigmas(_covariances(found, navigation, p), found.poses, navigation)
+        sigma = tuple(np.where(np.isnan(one), other, one) for one, other in zip(own, sigma, strict=True))
+    sigma_m, covariance_xy, sigma_tilt = sigma
     # a tie point that ended behind a camera is a wrong match that nothing is left of
     ahead = np.isfinite(found.residual_px).all(1)
     sights, left_px = Sights(*(column[ahead] for column in found.block.sights)), found.residual_px[ahead]
@@ -107,14 +113,26 @@ def adjust(
     count = len(chained.status)
     held = _by_laser(found, lines, count)
     return chained._replace(
-        poses=found.poses,
+        poses=_with_loose(found.poses, chained.poses),
         sigma_m=sigma_m,
         covariance_xy_m2=covariance_xy,
         sigma_tilt_rad=sigma_tilt,
         reprojection_px=rms_px,
-        residuals=remaining.of(count, sights, left_px, found.block.crossed),
+        residuals=remaining.of(count, sights, left_px, crossovers.apart(found.poses, found.block.crossed)),
         status=["adjusted" if ok else status for status, ok in zip(chained.status, held, strict=True)],
     )
+
+
+def _with_loose(found: Poses, chained: Poses) -> Poses:
+    """Images that were left out lie to the nearest one in time that was not as they did in the chain."""
+    R, C = found.R_local_camera.copy(), found.C_local.copy()
+    held = np.flatnonzero(found.known)
+    for k in np.flatnonzero(chained.known & ~found.known).tolist():
+        near = held[np.abs(held - k).argmin()]
+        turn = R[near] @ chained.R_local_camera[near].T
+        R[k] = turn @ chained.R_local_camera[k]
+        C[k] = C[near] + turn @ (chained.C_local[k] - chained.C_local[near])
+    return Poses(R, C)
 
 
 def _by_laser(found: Bundle, lines: Lines, count: int) -> NDArray[np.bool_]:
@@ -143,8 +161,8 @@ def refine(
 ) -> Bundle | None:
     """The poses that have a start, adjusted together.
 
-    None where images share no tie point and no laser line crosses, or, without navigation, where tie points and laser
-    leave an image or the scale open.
+    None where images share no tie point and no laser line crosses, or, without navigation, where the laser leaves the
+    scale open. Without navigation images that tie points do not hold to the rest are left out, and have no pose.
 
     soundings : (L, 3) of each image with a laser, camera frame. lines : the same as lines.
     """
@@ -156,18 +174,23 @@ def refine(
     sigma_px, rough = _FIRST_SIGMA_PX, laser_ranges.FIRST_ROUGHNESS
     for gate_px, tolerance in zip(_GATES_PX, _TOLERANCES, strict=True):
         gate_px = max(gate_px, _GATE_SIGMAS * sigma_px)
-        sights, x, X, focal_px = _inliers(camera, poses, sights, depth, gate_px)
+        sights, x, X, pixels = _inliers(camera, poses, sights, depth, gate_px)
         crossed = crossovers.believable(crossovers.find(poses, lines), unknowns)
         if not len(X) and not len(crossed.i):
             return None
         ranges = _believable(poses, X, laser_ranges.measure(poses, X, lit, p.max_ranges), rough)
-        if navigation is None and not determined(poses.known, sights, ranges):
-            return None
-        block = Block(sights, x, X, focal_px, ranges, rough, crossed)
+        if navigation is None:
+            held = determined(poses.known, sights, ranges)
+            if not held.any():
+                return None
+            if (poses.known & ~held).any():
+                again = _only(start, held), sights.take(held[sights.image]), soundings, lines
+                return refine(camera, *again, navigation, p)
+        block = Block(sights, x, X, pixels, ranges, rough, crossed)
         o, afloat = _observations(block, poses, sigma_px, p), navigation is not None
         crossing = _with_crossovers(fixed, block, State(values, poses, X), p)
         values, poses, X = solve(crossing, State(values, poses, X), o, tolerance, afloat)
-        residual_px = residuals(poses, sights, x, X) * focal_px
+        residual_px = residuals(poses, sights, x, X) * pixels
         sigma_px, rough = _noise_px(residual_px, len(X)), laser_ranges.roughness(poses, X, ranges)
         unknowns = crossovers.LEAST_OF_IMAGE * len(np.union1d(crossed.i, crossed.j))
         bundle = Bundle(poses, block._replace(X=X, roughness=rough), residual_px, sigma_px)
@@ -175,25 +198,38 @@ def refine(
 
 
 def _where_navigation_is(bundle: Bundle, navigation: NavigationPrior) -> Bundle:
-    """The whole of it moved to where navigation has it on average, in which nothing else has a say.
+    """The whole of it moved to where navigation has it, in which nothing else has a say.
 
-    `reduction.solve` leaves the map as a whole where it began.
+    `reduction.solve` leaves the map as a whole where it began. Images count by what navigation knows of them, and
+    those of which it is wrong little.
     """
     poses = bundle.poses
     both = poses.known & navigation.poses.known
-    shift = (navigation.poses.C_local[both] - poses.C_local[both]).mean(0)
+    off = (navigation.poses.C_local - poses.C_local)[both]
+    sigma = np.column_stack([navigation.sigma_horizontal, navigation.sigma_horizontal, navigation.sigma_depth])[both]
+    shift = np.median(off, axis=0)
+    for _ in range(_SHIFT_ROUNDS):
+        weight = np.minimum(1, DOUBTFUL * sigma / np.maximum(np.abs(off - shift), 1e-12)) / sigma**2
+        shift = (weight * off).sum(0) / weight.sum(0)
     moved = poses._replace(C_local=poses.C_local + shift)
     return bundle._replace(poses=moved, block=bundle.block._replace(X=bundle.block.X + shift))
 
 
-def determined(known: NDArray[np.bool_], sights: Sights, ranges: Ranges) -> bool:
-    """Whether tie points join all images that have a pose (n,), and ranges of images that see them give the scale."""
-    if not np.isin(ranges.image, sights.image).any():
-        return False
+def determined(known: NDArray[np.bool_], sights: Sights, ranges: Ranges) -> NDArray[np.bool_]:
+    """Which images of those with a pose (n,) tie points join: of several blocks the largest whose scale ranges tell."""
     count = len(known)
     seen = np.bincount(sights.image, minlength=count)
-    joined = remaining.blocks(count + sights.tie_points, np.column_stack([sights.image, count + sights.track]))[:count]
-    return bool((seen[known] >= _LEAST_SIGHTS).all()) and len(np.unique(joined[known])) == 1
+    block = remaining.blocks(count + sights.tie_points, np.column_stack([sights.image, count + sights.track]))[:count]
+    held = known & (seen >= _LEAST_SIGHTS)
+    ranged = np.isin(block, block[ranges.image[np.isin(ranges.image, sights.image)]])
+    sizes = np.bincount(block[held & ranged], minlength=count + 1)
+    return held & ranged & (block == sizes.argmax())
+
+
+def _only(poses: Poses, held: NDArray[np.bool_]) -> Poses:
+    """The poses of some images (n,) only."""
+    where = held[:, None]
+    return Poses(np.where(where[..., None], poses.R_local_camera, np.nan), np.where(where, poses.C_local, np.nan))
 
 
 def _fixed(poses: Poses, navigation: NavigationPrior | None) -> Any:
@@ -244,18 +280,18 @@ def _covariances(found: Bundle, navigation: NavigationPrior | None, p: AdjustPar
 
 def _inliers(camera: Camera, poses: Poses, sights: Sights, depth: float, gate_px: float):
     """Sights that agree, their slopes x (M, 2), the tie points X (N, 3), and the focal length in pixels."""
-    focal_px = depth / ground_sample_distance(camera, depth)
+    pixels = focal_px(camera, depth)
     x = normalised(camera, sights.uv, depth)
     X, parallax = intersect(poses, sights, x)
     if camera.port is not None:  # its slopes hold at one depth only
         Z = in_cameras(poses, sights, X)[:, 2]
         x = normalised(camera, sights.uv, np.where(Z > 0, Z, depth))
         X, parallax = intersect(poses, sights, x)
-    off = np.linalg.norm(residuals(poses, sights, x, X), axis=1) * focal_px
+    off = np.linalg.norm(residuals(poses, sights, x, X), axis=1) * pixels
     good = (off < gate_px) & (parallax > _LEAST_PARALLAX)[sights.track]
     kept = sights.kept(good)
     sights, x = sights.take(good), x[kept]
-    return sights, x, intersect(poses, sights, x)[0], focal_px
+    return sights, x, intersect(poses, sights, x)[0], pixels
 
 
 def in_cameras(poses: Poses, sights: Sights, X: Array) -> Array:

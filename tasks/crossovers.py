@@ -163,6 +163,15 @@ def normals(slope: Array, sigma: Array) -> Array:
     return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
+def apart(poses: Poses, found: Crossovers) -> Crossovers:
+    """The same crossings with how far the lines are apart by other poses."""
+    X_i, X_j = (
+        np.einsum("kij,kj->ki", poses.R_local_camera[k], X) + poses.C_local[k]
+        for k, X in ((found.i, found.a), (found.j, found.b))
+    )
+    return found._replace(apart_m=((X_j - X_i) * found.normal).sum(1))
+
+
 def believable(found: Crossovers, unknowns: int) -> Crossovers:
     """Crossovers with the sigma that their scatter says, without those that no surface can explain.
 

@@ -15,7 +15,7 @@ from .navigation import NavigationPrior, Poses, relative, walk_m
 Array = NDArray[Any]
 
 _DATUM_SIGMA = 1e-5
-_DOUBTFUL = 4.0  # sigmas of an attitude, depth or step, from which on they are rather wrong than unlucky
+DOUBTFUL = 4.0  # sigmas of an attitude, depth or step, from which on they are rather wrong than unlucky
 _EXACT_M, _EXACT_RAD, _ANYWHERE_M = 3e-3, 5e-4, 1e2
 
 
@@ -87,14 +87,14 @@ def navigation_factors(navigation: NavigationPrior) -> Any:
         graph.add(gtsam.PriorFactorPose3(of_navigation(k), own, _noise(_EXACT_RAD, R, offset, bias)))
         attitude = _attitude(navigation, k, count)
         tie = _noise(attitude, R, _EXACT_M, float(navigation.sigma_depth[k]))
-        graph.add(gtsam.BetweenFactorPose3(of_navigation(k), k, gtsam.Pose3(), robust(tie, _DOUBTFUL)))
+        graph.add(gtsam.BetweenFactorPose3(of_navigation(k), k, gtsam.Pose3(), robust(tie, DOUBTFUL)))
     for a, b in itertools.pairwise(known):
         step = relative(navigation, a, b)
         between, R = pose(step.R_i_j, step.t_i_j), poses.R_local_camera[b]
         walk = _noise(_EXACT_RAD, R, walk_m(navigation, a, b) + _EXACT_M, _EXACT_M)
-        graph.add(gtsam.BetweenFactorPose3(of_navigation(a), of_navigation(b), between, robust(walk, _DOUBTFUL)))
+        graph.add(gtsam.BetweenFactorPose3(of_navigation(a), of_navigation(b), between, robust(walk, DOUBTFUL)))
         turn = _noise(step.covariance[:3, :3], R, _ANYWHERE_M, _ANYWHERE_M)
-        graph.add(gtsam.BetweenFactorPose3(a, b, between, robust(turn, _DOUBTFUL)))
+        graph.add(gtsam.BetweenFactorPose3(a, b, between, robust(turn, DOUBTFUL)))
     return graph
 
 

@@ -87,7 +87,7 @@ def _of_image(poses: Poses, k: int, own: Array, X: Array, slope: Array, tree: KD
     centre = ground[:, :2].mean(0)
     reach = _REACH * float(np.median(own[:, 2]))
     radius = np.linalg.norm(ground[:, :2] - centre, axis=1).max() + reach
-    near = np.array(sorted(tree.query_ball_point(centre, radius)), np.intp)
+    near = np.array(tree.query_ball_point(centre, radius, return_sorted=True), np.intp)
     near = near[width[near] < _WIDEST * reach]
     seen = (X[near] - C) @ R
     near, seen = near[seen[:, 2] > 0], seen[seen[:, 2] > 0]

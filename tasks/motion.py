@@ -26,6 +26,8 @@ _LASER_CONTRADICTS = 0.1  # spread of the depth ratios beyond which a motion is 
 _UNIT_LENGTH_SIGMA = 1e-3
 _MAX_MATCHES = 300
 _PLANE_POINTS = 500
+_STEEPEST = 0.5  # cosine of a plane's normal and the optical axis
+_SCALE_SHARE, _SCALE_SIGMAS = 0.02, 5.0  # by which the depths on a plane and those of the laser may differ
 
 
 class Plane(NamedTuple):
@@ -84,9 +86,12 @@ def fit_plane(X: Array, tolerance_m: float, trials: int = 200) -> Plane | None:
 
 
 def common_plane(X_i: Array, X_j: Array, parameters: MatchParameters) -> Plane | None:
-    """The plane of image i's soundings if those of both images are planar (paper III.E), else None."""
+    """The plane of image i's soundings if those of both images are planar (paper III.E), else None.
+
+    Soundings of one arm lie on a plane whatever the seabed: on the laser's sheet, which stands steep.
+    """
     planes = [fit_plane(X, parameters.planarity_m) for X in (X_i, X_j)]
-    if any(plane is None or plane.share < parameters.planar_share for plane in planes):
+    if any(plane is None or plane.share < parameters.planar_share or plane.normal[2] < _STEEPEST for plane in planes):
         return None
     return planes[0]
 
@@ -115,12 +120,32 @@ def estimate(
     plane = common_plane(laser_i, laser_j, parameters)
     start = None if plane is None else _from_homography(x_i, x_j, plane, focal_px, parameters)
     if start is not None and plane is not None:
-        return _refine_on_plane(x_i, x_j, start, plane, focal_px, parameters, laser_sigma)
+        motion = _refine_on_plane(x_i, x_j, start, plane, focal_px, parameters, laser_sigma)
+        share = 1.0 if motion is None else _depth_of_matches(motion, x_i, x_j, laser_i, laser_j)
+        if share != 1.0:
+            start = start._replace(t_i_j=share * start.t_i_j)
+            plane = plane._replace(offset=share * plane.offset)
+            motion = _refine_on_plane(x_i, x_j, start, plane, focal_px, parameters, laser_sigma)
+        if motion is not None:
+            return motion
     found = [
         _refine_epipolar(x_i, x_j, start, laser_i, laser_j, focal_px, parameters, prior, laser_sigma)
         for start in _starts(x_i, x_j, focal_px, parameters, prior)
     ]
     return max((motion for motion in found if motion is not None), key=_credit, default=None)
+
+
+def _depth_of_matches(motion: Motion, x_i: Array, x_j: Array, laser_i: Array, laser_j: Array) -> float:
+    """Depth of the matches by the laser beside them, over that of the plane: they may all lie on a box, say.
+
+    1 where the laser does not contradict the plane.
+    """
+    x_i, x_j = x_i[motion.inliers], x_j[motion.inliers]
+    depth_i, depth_j = depths(x_i, x_j, motion.R_i_j, motion.t_i_j)
+    found = laser_scale([(x_i, depth_i, laser_i), (x_j, depth_j, laser_j)])
+    if not np.isfinite(found.scale) or abs(np.log(found.scale)) < _SCALE_SHARE + _SCALE_SIGMAS * found.sigma:
+        return 1.0
+    return found.scale
 
 
 def _credit(motion: Motion) -> tuple[bool, float]:

@@ -101,7 +101,7 @@ def relative(navigation: NavigationPrior, i: int, j: int) -> RelativePrior:
     """Motion from image i to image j by navigation.
 
     Attitudes err independently; positions by a random walk that never exceeds their stated sigma; the attitude of
-    the first image also turns the step that is measured in its frame.
+    the first image also turns and tilts the step that is measured in its frame.
     """
     poses = navigation.poses
     R_i, R_j = poses.R_local_camera[i], poses.R_local_camera[j]
@@ -109,7 +109,7 @@ def relative(navigation: NavigationPrior, i: int, j: int) -> RelativePrior:
     attitude = (navigation.sigma_attitude[i] ** 2 + navigation.sigma_attitude[j] ** 2) / 2
     turned = np.sqrt(attitude.max()) * float(np.linalg.norm(step))
     horizontal = walk_m(navigation, i, j) ** 2 + turned**2 + 1e-6
-    vertical = navigation.sigma_depth[i] ** 2 + navigation.sigma_depth[j] ** 2
+    vertical = navigation.sigma_depth[i] ** 2 + navigation.sigma_depth[j] ** 2 + attitude[:2].max() * (step @ step)
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = navigation.R_camera_vehicle @ np.diag(2 * attitude) @ navigation.R_camera_vehicle.T
     covariance[3:, 3:] = R_j.T @ np.diag([horizontal, horizontal, vertical]) @ R_j

@@ -15,6 +15,7 @@ Array = NDArray[Any]
 # base over height: a shorter one says little of depth, and on a longer one steep ground looks too different
 _SHORTEST_BASE, _GOOD_BASE, _LONGEST_BASE = 0.05, 0.25, 0.7
 _LEAST_OVERLAP = 0.15
+_NEAREST = 4  # times as many pairs as are wanted of an image: where there are more, the nearest are looked at
 
 
 class Pairs(NamedTuple):
@@ -45,13 +46,18 @@ def footprints(camera: Camera, poses: Poses, range_m: Array, points_per_side: in
 def overlapping(outlines: Array, margin_m: Array, min_overlap: float, max_per_image: int) -> Pairs:
     """Pairs whose footprints (n, M, 2), each grown by margin_m (n,) for what its pose may be wrong, overlap enough.
 
-    Of each image the `max_per_image` largest overlaps are kept. Rows of NaN (no pose) pair with nothing.
+    Of each image the `max_per_image` largest overlaps with earlier images, and as many with later ones, are kept.
+    Rows of NaN (no pose) pair with nothing.
     """
     known = np.flatnonzero(np.isfinite(outlines).all((1, 2)))
     hulls = shapely.convex_hull(shapely.linestrings(outlines[known]))
     grown = np.asarray(shapely.buffer(hulls, margin_m[known], quad_segs=2))
     left, right = shapely.STRtree(grown).query(grown, predicate="intersects")
     left, right = left[left < right], right[left < right]
+    if len(left) > _NEAREST * max_per_image * len(grown):  # a vehicle that stays in its place: all see the same
+        centre = shapely.get_coordinates(shapely.centroid(grown))
+        away = np.linalg.norm(centre[left] - centre[right], axis=1)
+        left, right = _largest_of_each(np.column_stack([left, right]), -away, _NEAREST * max_per_image).images.T
     shared = shapely.area(shapely.intersection(grown[left], grown[right]))
     overlap = shared / np.minimum(shapely.area(grown[left]), shapely.area(grown[right]))
     pairs = np.column_stack([known[left], known[right]])
@@ -75,7 +81,7 @@ def for_depth(outlines: Array, images: NDArray[np.intp], base_to_height: Array, 
 
 
 def _largest_of_each(pairs: NDArray[np.intp], overlap: Array, count: int) -> Pairs:
-    """Keep a pair when it is among the largest overlaps of either of its images."""
+    """Keep a pair when it is among the `count` largest overlaps of i with later images, or of j with earlier ones."""
     keep = np.zeros(len(pairs), bool)
     for side in (0, 1):
         order = np.lexsort((-overlap, pairs[:, side]))

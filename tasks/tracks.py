@@ -11,6 +11,9 @@ Array = NDArray[Any]
 Indices = NDArray[np.signedinteger[Any]]
 
 
+_LONGEST = 40  # sights of a track
+
+
 class Sights(NamedTuple):
     """What images see of tie points; sorted by track, then image.
 
@@ -58,7 +61,7 @@ def join(matches: list[PairMatches]) -> Sights:
 
     A track that holds two features of one image has a wrong match in it and is left out.
     """
-    if not matches:
+    if not any(len(m.features) for m in matches):
         return Sights(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 2), np.float32))
     # a number for every feature that an image may have: all matches of a mission are many, and sorting them is dear
     each = 1 + max(int(m.features.max(initial=0)) for m in matches)
@@ -88,6 +91,13 @@ def join(matches: list[PairMatches]) -> Sights:
     return Sights(image, track, uv).take(~torn[track])
 
 
+def _shortened(sights: Sights) -> Sights:
+    """No track longer than it takes: where a vehicle stays in its place, some of the sights, evenly, tell as much."""
+    length, first = np.bincount(sights.track), np.searchsorted(sights.track, np.arange(sights.tie_points))
+    place, own = np.arange(len(sights.track)) - first[sights.track], np.maximum(length[sights.track], _LONGEST)
+    return sights.take((place * _LONGEST) // own != ((place - 1) * _LONGEST) // own)
+
+
 def thin(sights: Sights, shape: tuple[int, int], cells: int, most: int) -> Sights:
     """Tracks enough to hold every image: of each cell of each image the longest tracks.
 
@@ -99,6 +109,7 @@ def thin(sights: Sights, shape: tuple[int, int], cells: int, most: int) -> Sight
     """
     if not sights.tie_points:
         return sights
+    sights = _shortened(sights)
     length = np.bincount(sights.track)
     side = max(shape) / cells
     column, row = (np.clip(sights.uv // side, 0, cells - 1).astype(np.int64)).T

@@ -3,11 +3,9 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from ..tasks.frames import MapFrame
 from ..tasks.grids import Grid
-from .job import Job, array_digest, stage
+from .job import Job, rounded_digest, stage
 from .solve import Solution
 
 
@@ -80,4 +78,4 @@ def pose_digest(solution: Solution, rows: Sequence[int]) -> str:
     rows = list(rows)
     poses = solution.poses
     values = poses.R_local_camera[rows], poses.C_local[rows], solution.sigma_m[rows], solution.sigma_tilt_rad[rows]
-    return array_digest(*(np.round(value, 9) for value in values))
+    return rounded_digest(*values)

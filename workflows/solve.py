@@ -13,7 +13,7 @@ from ..tasks.adjust import Adjusted, Link
 from ..tasks.navigation import NavigationPrior, Poses
 from ..tasks.residuals import Residuals
 from . import extract, match
-from .job import Done, Job, Made, array_digest, code_version, load, once, read, stage
+from .job import Done, Job, Made, code_version, load, once, read, rounded_digest, stage
 
 STEP = "adjust"
 VERSION = code_version(sys.modules[__name__])
@@ -58,8 +58,8 @@ def adjust_all(
     inputs += [f"{row}:{done.key}" for row, done in sorted(lit.items())]
     if prior is not None:
         measured = (prior.time_s, prior.sigma_horizontal, prior.sigma_depth, prior.sigma_attitude)
-        inputs.append(array_digest(*prior.poses, *measured))
-    inputs.append(array_digest(R_first))
+        inputs.append(rounded_digest(*prior.poses, *measured))
+    inputs.append(rounded_digest(R_first))
     parameters = stage(job.calibration.camera, job.parameters.adjust)
 
     def make() -> Made:
@@ -89,7 +89,8 @@ def _chained(
 
 
 def _links(job: Job, linked: Sequence[tuple[int, int, Done]]) -> list[Link]:
-    return [match.link(i, j, load(job, match.STEP, done.key)) for i, j, done in linked]
+    names = "R", "t", "covariance"
+    return [match.link(i, j, load(job, match.STEP, done.key, names)) for i, j, done in linked]
 
 
 def would_change(job: Job, made: Done, later: Sequence[tuple[int, int, Done]], prior: NavigationPrior) -> bool:

@@ -144,13 +144,46 @@ def test_without_navigation_tie_points_must_join_all_and_ranges_give_the_scale()
     sights, known = tracks.join(_matches(LENS, points, poses, rng)), np.ones(18, bool)
     under = points[np.linalg.norm(points[:, :2] - poses.C_local[0, :2], axis=1) < 0.6]
     ranges = laser_ranges.measure(poses, under, {0: scenes.cross(0.15, poses, 0, rng)}, 10)
-    assert bundle.determined(known, sights, ranges)
-    assert not bundle.determined(known, sights, ranges.take(np.zeros(len(ranges.image), bool)))
-    halves = sights.image < 9
+    assert bundle.determined(known, sights, ranges).all()
+    assert not bundle.determined(known, sights, ranges.take(np.zeros(len(ranges.image), bool))).any()
+    halves, rows = sights.image < 9, np.arange(18)
     apart = sights._replace(track=np.unique(sights.track * 2 + halves, return_inverse=True)[1])
-    assert not bundle.determined(known, apart, ranges)
-    assert not bundle.determined(known, sights.take(sights.image != 17), ranges)
-    assert bundle.determined(np.arange(18) != 17, sights.take(sights.image != 17), ranges)
+    np.testing.assert_array_equal(bundle.determined(known, apart, ranges), rows < 9)  # the range is of image 0
+    alone = sights.take(sights.image != 17)
+    np.testing.assert_array_equal(bundle.determined(known, alone, ranges), rows != 17)
+    np.testing.assert_array_equal(bundle.determined(rows != 17, alone, ranges), rows != 17)
+
+
+def test_an_image_that_nothing_holds_does_not_keep_the_others_from_being_adjusted():
+    rng, poses, points = np.random.default_rng(4), _survey(), scenes.seabed(0.15, count=20_000)
+    moved = Poses(poses.R_local_camera, poses.C_local + rng.normal(0, 0.01, poses.C_local.shape))
+    sights = tracks.join(_matches(LENS, points, poses, rng))
+    soundings = {k: scenes.cross(0.15, poses, k, rng) for k in range(18)}
+    alone, start = sights.take(sights.image != 17), _chained(moved)
+    found = bundle.adjust(LENS, start, alone, soundings, NO_LINES, None, P)
+    assert 1e-4 < _rms(found.poses.C_local[:17], poses.C_local[:17]) < 0.004
+    step, first = (C[17] - C[16] for C in (found.poses.C_local, moved.C_local))
+    assert np.linalg.norm(step) == pytest.approx(np.linalg.norm(first))
+    assert 0 < np.linalg.norm(step - first) < 0.02
+    assert (found.sigma_m[17] == start.sigma_m[17]).all()
+    assert found.sigma_m[16].max() < 0.02
+
+
+def test_the_map_lies_where_the_images_that_navigation_knows_say():
+    rng, poses, points = np.random.default_rng(6), _survey(), scenes.seabed(0.15, count=20_000)
+    navigation, lost, wrong = _navigation(poses, rng), np.arange(5, 10), 12
+    sights = tracks.join(_matches(LENS, points, poses, rng))
+    soundings = {k: scenes.cross(0.15, poses, k, rng) for k in range(18)}
+    usual = bundle.adjust(LENS, _chained(navigation.poses), sights, soundings, NO_LINES, navigation, P)
+    C, sigma = navigation.poses.C_local.copy(), navigation.sigma_horizontal.copy()
+    C[lost] += [3.0, 2.0, 0.0]
+    C[wrong, 2] += 5.0
+    sigma[lost] = 30.0
+    misled = navigation._replace(poses=navigation.poses._replace(C_local=C), sigma_horizontal=sigma)
+    found = bundle.adjust(LENS, usual, sights, soundings, NO_LINES, misled, P)
+    off = found.poses.C_local - usual.poses.C_local
+    assert 0 < np.linalg.norm(off[:, :2], axis=1).max() < 0.1
+    assert 0 < np.abs(off[:, 2]).max() < 0.03
 
 
 def test_what_nothing_holds_leaves_the_start():

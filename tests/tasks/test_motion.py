@@ -43,6 +43,44 @@ def test_the_laser_decides_between_homography_and_essential_matrix():
         assert (motion.common_plane(*lasers, P) is not None) == planar
 
 
+def _one_arm(points, poses, k):
+    """Soundings of a single sheet, in which they lie to rounding."""
+    normal = np.array([0.7, 0.65, 0.3]) / np.linalg.norm([0.7, 0.65, 0.3])
+    _, seen = scenes.view(points, poses, k)
+    X = (points[seen] - poses.C_local[k]) @ poses.R_local_camera[k]
+    off = X @ normal - 0.65
+    near = np.abs(off) < 0.01
+    return X[near] * (0.65 / (0.65 + off[near]))[:, None]
+
+
+def test_soundings_of_one_arm_lie_on_its_sheet_and_tell_nothing_of_the_seabed():
+    rng, dense = np.random.default_rng(0), scenes.seabed(0.25, count=400_000)
+    points, poses = scenes.seabed(0.25), scenes.cameras([[0, 0, 0], [0.1, 0.5, 0.05]], seed=2)
+    arms = [_one_arm(dense, poses, k) for k in (0, 1)]
+    assert motion.fit_plane(arms[0], P.planarity_m).share == 1
+    assert motion.common_plane(*arms, P) is None
+    found = motion.estimate(*scenes.matches(points, poses, 0, 1, rng), *arms, scenes.FOCAL_PX, P)
+    _, t = scenes.true_motion(poses, 0, 1)
+    assert (found.model, found.metric) == ("essential", True)
+    assert 1e-4 < np.linalg.norm(found.t_i_j - t) < 0.03
+
+
+def test_features_on_a_box_do_not_take_their_scale_from_the_floor_around_it():
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(-1.2, 1.2, (60_000, 2))
+    box = (np.abs(xy) < 0.5).all(1)
+    points, textured = np.column_stack([xy, np.where(box, -2.77, -3.0)]), (np.abs(xy) < 0.35).all(1)
+    poses = scenes.cameras([[0, 0, 0], [0.1, 0.3, 0]], seed=3)
+    lasers = [
+        np.concatenate([scenes.laser(points[side], poses, k, rng)[:most] for side, most in ((~box, 900), (box, 60))])
+        for k in (0, 1)
+    ]
+    assert motion.common_plane(*lasers, P) is not None
+    found = motion.estimate(*scenes.matches(points[textured], poses, 0, 1, rng), *lasers, scenes.FOCAL_PX, P)
+    _, t = scenes.true_motion(poses, 0, 1)
+    assert 1e-5 < abs(np.linalg.norm(found.t_i_j) / np.linalg.norm(t) - 1) < 0.03
+
+
 def test_without_laser_the_direction_is_right_and_the_length_open():
     rng = np.random.default_rng(3)
     points, poses = scenes.seabed(0.3), scenes.cameras([[0, 0, 0], [0.2, 0.9, 0]])

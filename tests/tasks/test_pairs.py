@@ -37,6 +37,16 @@ def test_of_many_overlaps_the_largest_are_kept():
     assert np.diff(found.images, axis=1).max() <= 4
 
 
+def test_where_a_vehicle_stays_in_its_place_the_nearest_are_looked_at():
+    rng, count = np.random.default_rng(0), 300
+    poses = _line(count, 0.0)
+    poses.C_local[:] += rng.normal(0, 0.1, poses.C_local.shape)
+    outlines = pairs.footprints(LENS, poses, np.full(count, 3.0))
+    found = pairs.overlapping(outlines, np.zeros(count), 0.05, 4)
+    assert 2 * count < len(found.images) <= 8 * count
+    assert 0.8 < np.median(found.overlap) < 1
+
+
 def test_images_without_a_pose_pair_with_nothing():
     poses = _line(3, 0.5)
     poses.C_local[1] = np.nan

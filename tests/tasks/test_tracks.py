@@ -42,6 +42,15 @@ def test_a_tie_point_is_kept_while_two_images_see_it(keep):
     assert sights.kept(mask).sum() == len(left.track)
 
 
+def test_a_track_through_very_many_images_is_shortened_evenly():
+    sights = tracks.join([_pair(k, k + 1, [[0, 0], [1, 1]] if k < 9 else [[0, 0]]) for k in range(199)])
+    thinned = tracks.thin(sights, (900, 1200), 16, 2)
+    long = thinned.image[thinned.track == np.bincount(thinned.track).argmax()]
+    assert len(long) == 40
+    assert (long[0], np.diff(long).max()) == (0, 5)
+    assert sorted(np.bincount(thinned.track)) == [10, 40]
+
+
 def test_thinning_takes_the_longest_tracks_of_each_cell():
     rng = np.random.default_rng(0)
     uv = rng.uniform(0, 1200, (500, 2)) * [1, 0.75]
