@@ -1,7 +1,10 @@
-"""What the first and last bytes of an image file tell: format, size, EXIF time, and whether the end is there."""
+"""What the bytes of an image file tell before it is decoded: format, size, EXIF time, and whether it is whole."""
 
 import io
+from collections.abc import Iterator
 from typing import BinaryIO, NamedTuple
+
+import numpy as np
 
 from .tiff_directory import Directory, exif_fields, first_directory
 
@@ -11,6 +14,9 @@ HEADER_BYTES = 256 * 1024
 TAIL_BYTES = 64 * 1024
 
 _START_OF_FRAME = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
+_SEQUENTIAL, _HUFFMAN_TABLES, _END, _SCAN = (0xC0, 0xC1), 0xC4, 0xD9, 0xDA
+_BETWEEN_SCANS = {_HUFFMAN_TABLES, _SCAN, 0xDB, 0xDC, 0xDD, 0xFE}
+_ZEROS = bytes(64)
 _TIME, _SUBSECONDS, _OFFSET = 0x9003, 0x9291, 0x9011
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 _TIFF_STRIPS = ((273, 279), (324, 325))
@@ -64,7 +70,7 @@ def _jpeg(head: bytes, tail: bytes) -> Header:
         if marker == 0xE1 and body[:6] == b"Exif\0\0":
             exif = exif or body[6:]
         position += 2 + length
-        if marker == 0xDA:
+        if marker == _SCAN:
             break
     if not width:
         return Header(0, 0, "", "file is truncated or damaged (no JPEG frame header)")
@@ -72,6 +78,49 @@ def _jpeg(head: bytes, tail: bytes) -> Header:
     body = head[position:] if len(head) < HEADER_BYTES else tail
     fault = "" if b"\xff\xd9" in body else "file is truncated (no JPEG end marker)"
     return Header(width, height, _exif_time(io.BytesIO(exif)), fault)
+
+
+def damage(content: bytes) -> str:
+    """What is wrong with the compressed data of a JPEG file; empty if nothing is seen.
+
+    Decoders go on behind damage, with all that follows in a wrong place. Bytes that were overwritten hold markers that
+    have no place there; blocks that never reached the disk are zeros, which are no more than code of plain image only
+    where all tables say so.
+    """
+    fault = "file is damaged (bytes in its middle are not of the image)"
+    scan, sequential, plain = 0, False, True
+    for place, marker, body in _segments(content):
+        if marker == _END:
+            return fault if sequential and not plain and content.find(_ZEROS, scan, place) >= 0 else ""
+        if scan and marker not in _BETWEEN_SCANS:
+            return fault
+        sequential |= marker in _SEQUENTIAL
+        if marker == _HUFFMAN_TABLES:
+            plain &= _zeros_are_plain(body)
+        if marker == _SCAN:
+            scan = scan or place
+    return "file is truncated (no JPEG end marker)"
+
+
+def _segments(content: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Place, marker and body of each segment of a JPEG file and of whatever looks like one in its compressed data."""
+    data = np.frombuffer(content, np.uint8)
+    places = np.flatnonzero(data[:-1] == 0xFF)
+    marker = data[places + 1]
+    position = 2
+    for place in places[(marker != 0) & (marker != 0xFF) & ((marker < 0xD0) | (marker > 0xD7))].tolist():
+        if place >= position:
+            position = place + 2 + int.from_bytes(content[place + 2 : place + 4], "big")
+            yield place, content[place + 1], content[place + 4 : position]
+
+
+def _zeros_are_plain(tables: bytes) -> bool:
+    """Whether the code of zeros alone, which comes first in each of some Huffman tables, is the end of a block."""
+    while len(tables) > 17:
+        if tables[0] >> 4 and tables[17]:
+            return False
+        tables = tables[17 + sum(tables[1:17]) :]
+    return True
 
 
 def _png(head: bytes, tail: bytes) -> Header:

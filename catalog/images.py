@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..schemas.calibration import Camera
 from .digests import sha256
 from .filesystems import ObjectStoreError, asking, connect
-from .image_headers import HEADER_BYTES, TAIL_BYTES, read_header
+from .image_headers import HEADER_BYTES, TAIL_BYTES, damage, read_header
 
 
 class UnreadableImage(Exception):
@@ -48,6 +48,7 @@ class DecodedImage(NamedTuple):
 
 
 _JPEG: Final = b"\xff\xd8"
+_DARK, _TWELVE_BITS = 255, 4096  # levels of 16 bits
 _REDUCED: Final = {
     1: cv2.IMREAD_COLOR,
     2: cv2.IMREAD_REDUCED_COLOR_2,
@@ -112,26 +113,42 @@ def decode(content: bytes, camera: Camera, reduce: int = 1) -> NDArray[np.uint8]
     """Decode the bytes of a JPEG, PNG or TIFF file into BGR, uint8 (rows, cols, 3).
 
     16 bits a channel become 8. The EXIF rotation is not applied: calibrations are of the sensor. What OpenCV
-    would fill with grey (a truncated JPEG) is refused. Raises UnreadableImage.
+    would fill with grey or show in a wrong place (a truncated or damaged JPEG) is refused, and so is 16 bits a channel
+    that holds no more than 12. Raises UnreadableImage.
 
     reduce : 1, 2, 4 ...: rows and columns so many times fewer, rounded up, each pixel the mean of those that it
         stands for; of a JPEG the rest is never decoded.
     """
     fault = read_header(content[:HEADER_BYTES], content[-TAIL_BYTES:], io.BytesIO(content)).fault
+    jpeg = content[:2] == _JPEG
+    if jpeg and reduce == 1 and not fault:  # what is read smaller has been read whole before
+        fault = damage(content)
     if fault:
         raise UnreadableImage(fault)
-    in_file = min(reduce, max(_REDUCED)) if content[:2] == _JPEG else 1
+    in_file = min(reduce, max(_REDUCED)) if jpeg else 1
+    how = cv2.IMREAD_IGNORE_ORIENTATION | (0 if jpeg else cv2.IMREAD_ANYDEPTH)
     try:
-        bgr = cv2.imdecode(np.frombuffer(content, np.uint8), _REDUCED[in_file] | cv2.IMREAD_IGNORE_ORIENTATION)
+        bgr = cv2.imdecode(np.frombuffer(content, np.uint8), _REDUCED[in_file] | how)
     except cv2.error:
         bgr = None
-    if bgr is None:
+    if bgr is None or bgr.dtype not in (np.uint8, np.uint16):
         raise UnreadableImage("file is damaged (it cannot be decoded)")
     if bgr.shape[:2] != _reduced(camera, in_file):
         raise UnreadableImage(size_fault(bgr.shape[1] * in_file, bgr.shape[0] * in_file, camera))
+    if bgr.dtype == np.uint16:
+        bgr = _eight_bits(bgr)
     if reduce > in_file:
         bgr = cv2.resize(bgr, _reduced(camera, reduce)[::-1], interpolation=cv2.INTER_AREA)
     return np.asarray(bgr, np.uint8)
+
+
+def _eight_bits(deep: NDArray) -> NDArray[np.uint8]:
+    most = int(deep.max())
+    if _DARK < most < _TWELVE_BITS:
+        raise UnreadableImage(
+            f"12 bits in a 16-bit file: no more than {most} of 65535; scale every image by 16 and write them again"
+        )
+    return (deep >> 8).astype(np.uint8)
 
 
 def _reduced(camera: Camera, times: int) -> tuple[int, int]:

@@ -70,8 +70,8 @@ class LaserPlane(Model):
         if abs(self.normal[1]) < 1e-6:
             raise inconsistent(
                 "normal",
-                "a sheet along the image's columns",
-                "a sheet that crosses the image's rows at one point each",
+                "a sheet along the image's columns, as in a plus along rows and columns",
+                "one rising and one falling arm (a cross, paper III.A)",
                 "Check the order of the components: x right, y down in the image, z along the optical axis.",
             )
         return self
@@ -106,7 +106,7 @@ def _how_given(planes: object) -> str | None:
 class Laser(Model):
     """The projected cross: two sheets, given as planes or by the cross's geometry."""
 
-    wavelength_nm: Annotated[float, Field(ge=380, le=800)] = 532.0
+    wavelength_nm: Annotated[float, Field(ge=500, le=560, description="nm; the detector looks for green light")] = 532.0
     origin: Annotated[Vector, Field(description="emitter, camera frame, metres")]
     planes: Annotated[
         Annotated[tuple[LaserPlane, LaserPlane], Tag("planes")] | Annotated[CrossGeometry, Tag("geometry")],

@@ -173,6 +173,11 @@ def ground_sample_distance(camera: Camera, range_m: float) -> float:
     return float(range_m * np.sqrt(np.linalg.norm(slopes[1] - slopes[0]) * np.linalg.norm(slopes[2] - slopes[0])))
 
 
+def focal_px(camera: Camera, range_m: float) -> float:
+    """Pixels a slope at the image's centre, in water: behind a flat port a third more than fx."""
+    return range_m / ground_sample_distance(camera, range_m)
+
+
 def outline(camera: Camera, points_per_side: int = 2) -> Array:
     """Pixels (4 (n - 1), 2) around the image's border, clockwise from the top left corner."""
     t = np.linspace(0, 1, points_per_side)[:-1]

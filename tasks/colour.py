@@ -24,8 +24,9 @@ _NEAR: Final = 0.15  # share of the depth that a cell's laser points may be off 
 def thumbnail(image: Pixels, mask: Mask) -> Array32:
     """Means (24, 32, 3) of an image (H, W, 3) over its unmasked pixels; NaN where nearly all are masked."""
     size = THUMBNAIL[::-1]
-    kept = np.asarray(cv2.copyTo(image, (~mask).astype(np.uint8), np.zeros_like(image)))
-    weight = (~mask).astype(np.float32)
+    seen = ~mask
+    kept = np.asarray(cv2.copyTo(image, seen.view(np.uint8)))
+    weight = seen.astype(np.float32)
     shrink = min(_SHRINK, image.shape[1] // THUMBNAIL[1], image.shape[0] // THUMBNAIL[0])
     if shrink > 1:
         smaller = image.shape[1] // shrink, image.shape[0] // shrink

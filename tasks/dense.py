@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..schemas.calibration import Camera
-from .camera import normalised, outline, project, rays
+from .camera import focal_px, normalised, outline, project, rays
 from .dense_refine import Refined
 from .navigation import Poses
 from .nodes import upsample
@@ -88,23 +88,34 @@ class Relief(NamedTuple):
     noise_px: Array
 
 
-def rectify(
-    camera: Camera, poses: Poses, i: int, j: int, depths_m: tuple[float, float], scale: float
-) -> Rectified | None:
-    """How images i and j are rectified; None where they overlap too little or lie one above the other.
-
-    depths_m : least and largest distance along the optical axis at which the seabed may be. scale : of pixels.
-    """
-    C_i, C_j = poses.C_local[i], poses.C_local[j]
-    base, axis = C_j - C_i, poses.R_local_camera[i][:, 2] + poses.R_local_camera[j][:, 2]
+def rectified_axes(poses: Poses, i: int, j: int) -> Array | None:
+    """R_local_rect (3, 3) of `Rectified`, or None for images that lie one above the other or in one place."""
+    base, axis = poses.C_local[j] - poses.C_local[i], poses.R_local_camera[i][:, 2] + poses.R_local_camera[j][:, 2]
     base_m = float(np.linalg.norm(base))
     x = base / max(base_m, 1e-9)
     z = axis - (axis @ x) * x
     if base_m < 1e-3 or np.linalg.norm(z) < 0.9 * np.linalg.norm(axis):
         return None
     z = z / np.linalg.norm(z)
-    R_local_rect = np.column_stack([x, np.cross(z, x), z])
-    range_m, focal = float(np.sqrt(depths_m[0] * depths_m[1])), scale * camera.fx
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def rectify(
+    camera: Camera, poses: Poses, i: int, j: int, depths_m: tuple[float, float], scale: float
+) -> Rectified | None:
+    """How images i and j are rectified; None where they overlap too little or have no `rectified_axes`.
+
+    depths_m : least and largest distance along the rectified z at which the seabed may be. scale : of pixels, less
+        where these distances would take more disparities than are tried.
+    """
+    R_local_rect = rectified_axes(poses, i, j)
+    if R_local_rect is None:
+        return None
+    C_i = poses.C_local[i]
+    base_m = float((poses.C_local[j] - C_i) @ R_local_rect[:, 0])
+    range_m = float(np.sqrt(depths_m[0] * depths_m[1]))
+    most = (_MOST_DISPARITIES - 2) / (base_m * (1 / depths_m[0] - 1 / depths_m[1]))
+    focal = min(scale * focal_px(camera, range_m), most)
     slopes_i, slopes_j = (
         _rect_slopes(camera, R_local_rect.T @ poses.R_local_camera[k], range_m) * focal for k in (i, j)
     )
@@ -113,7 +124,7 @@ def rectify(
     low = np.floor(np.maximum(slopes_i.min(0), slopes_j.min(0) + (shift, 0))).astype(int)
     size = np.ceil(np.minimum(slopes_i.max(0), slopes_j.max(0) + (last, 0))).astype(int) - low
     count = int(np.ceil((last - np.floor(shift) + 1) / _DISPARITY_STEP)) * _DISPARITY_STEP
-    if (size < _LEAST_PX).any() or count > _MOST_DISPARITIES:
+    if (size < _LEAST_PX).any():
         return None
     # OpenCV finds nothing in as many columns at the left as there are disparities
     shape = int(size[1]), int(size[0]) + count

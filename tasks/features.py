@@ -46,7 +46,7 @@ def detect(
     if scale < 1:
         size = round(width * scale), round(height * scale)
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    mask = cv2.resize(ignore.astype(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
+    mask = np.asarray(cv2.resize(ignore.view(np.uint8), grey.shape[::-1], interpolation=cv2.INTER_NEAREST)).view(bool)
     threshold = parameters.contrast_threshold * 255 / interest.LAYERS
     found = interest.find(grey, mask, threshold, parameters.max_features, north_rad is None)
     if not len(found.uv):

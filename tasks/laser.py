@@ -34,6 +34,8 @@ _LOBE_OFFSET, _LOBE_HALFWIDTH = 6, 3
 _LOBE_SHARE: Final = 0.2
 _WINDOW_PX: Final = 12
 _SPECKLE_PX: Final = 0.25
+# Glow is no farther from the line than so many times what its light reaches.
+_GLOW_REACHES: Final = 8.0
 
 
 class LaserPoints(NamedTuple):
@@ -320,13 +322,14 @@ def mask(shape: tuple[int, int], uv: Array, halfwidth_px: float) -> NDArray[np.b
     inside = ((fixed >= -radius) & (fixed < np.array(shape[::-1]) + radius)).all(axis=1)
     for u, v in fixed[inside].tolist():
         cv2.circle(drawn, (u, v), radius, 1, cv2.FILLED)
-    return drawn.astype(bool)
+    return drawn.view(bool)
 
 
 def glow(image_bgr: NDArray[np.uint8], line_uv: Array, halfwidth_px: float, patch_px: tuple[float, float]) -> Array:
     """Pixels (M, 2) of laser light that mask() would leave: faint or running along the rows, where no row has a peak.
 
-    Patches greener, by 15 %, than what is around them, that hang together with the line found (line_uv).
+    Patches greener, by 15 %, and brighter in green than what is around them, that hang together with the line found
+    (line_uv) and are near it. Green leaves are no brighter than the sand around them.
 
     Parameters
     ----------
@@ -340,20 +343,27 @@ def glow(image_bgr: NDArray[np.uint8], line_uv: Array, halfwidth_px: float, patc
     scale = np.array(patch_px)
     width, height = (np.array(image_bgr.shape[1::-1]) / scale).astype(int).tolist()
     columns, rows = np.round(scale * (width, height)).astype(int)
-    small = cv2.resize(image_bgr[:rows, :columns], (width, height), interpolation=cv2.INTER_AREA)
+    small = np.asarray(cv2.resize(image_bgr[:rows, :columns], (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     # eight grey levels keep the noise of a dark image from counting as colour; 64 makes no colour a quarter of 255
     blue, green, red = (small[..., k].astype(np.float32) + 8 for k in range(3))
     ratio = np.minimum(128 * green / (blue + red), 255).astype(np.uint8)
-    # of every third patch: the median of a fifth of the image
-    around = cv2.medianBlur(np.ascontiguousarray(ratio[::3, ::3]), min(width, height) // 15 | 1)
-    around = cv2.resize(around, (width, height), interpolation=cv2.INTER_NEAREST)
-    patch = np.asarray(cv2.connectedComponents((ratio > 1.15 * around).astype(np.uint8), connectivity=8)[1], np.intp)
     drawn = _discs((height, width), (line_uv + 0.5) / scale - 0.5, halfwidth_px / scale[0])
+    away = cv2.distanceTransform((~drawn).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    lit = (ratio > 1.15 * _around(ratio)) & (small[..., 1] > _around(small[..., 1]))
+    lit &= away < (_GLOW_REACHES - 1) * halfwidth_px / scale[0]
+    patch = np.asarray(cv2.connectedComponents(lit.view(np.uint8), connectivity=8)[1], np.intp)
     touched = np.zeros(int(patch.max()) + 1, bool)
     touched[patch[drawn]] = True
     touched[0] = False
     rows, columns = np.nonzero(touched[patch] & ~drawn)
     return (np.column_stack([columns, rows]).astype(np.float64) + 0.5) * scale - 0.5
+
+
+def _around(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Medians (H, W) of a fifth of an image around, of every third pixel."""
+    height, width = values.shape
+    median = cv2.medianBlur(np.ascontiguousarray(values[::3, ::3]), min(width, height) // 15 | 1)
+    return np.asarray(cv2.resize(median, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
 def _discs(shape: tuple[int, int], uv: Array, halfwidth_px: float) -> NDArray[np.bool_]:

@@ -70,11 +70,6 @@ class Line(NamedTuple):
     width_px: Array
     signal_to_noise: Array
 
-    def take(self, keep: NDArray) -> "Line":
-        """The points that a mask or an index array (N,) selects."""
-        sigma_px, width_px, signal_to_noise = (field[keep] for field in self[2:])
-        return Line(self.uv[keep], self.arm[keep], sigma_px, width_px, signal_to_noise)
-
 
 class _Rows(NamedTuple):
     """Rows to measure, one entry each: row, rough column, column of the other arm there (NaN: none)."""

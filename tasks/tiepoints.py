@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..schemas.calibration import Camera
-from .camera import rays
+from .camera import focal_px, rays
 from .navigation import Poses
 
 Array = NDArray[Any]
 
 _MATCH_SIGMA_PX = 0.5
+_TYPICAL_M = 3.0  # behind a port the pixels a slope are within a hundredth of these at any distance
 _MAX_GAP_PX = 4.0
 _NEIGHBOURS = 8
 _STEEPEST = 1.5  # rise over run between a point and its neighbours
@@ -51,11 +52,12 @@ def triangulate(
     range_i = (along_i - cosine * along_j) / sine_squared
     range_j = (cosine * along_i - along_j) / sine_squared
     P_i, P_j = o_i + range_i[:, None] * d_i, o_j + range_j[:, None] * d_j
-    gap_px = np.linalg.norm(P_i - P_j, axis=1) / np.maximum(range_i, 1e-6) * camera.fx
+    focal = focal_px(camera, _TYPICAL_M)
+    gap_px = np.linalg.norm(P_i - P_j, axis=1) / np.maximum(range_i, 1e-6) * focal
     parallax = np.sqrt(sine_squared)
     keep = (range_i > 0) & (range_j > 0) & (gap_px < _MAX_GAP_PX) & (parallax > _MIN_PARALLAX)
     distance, parallax = range_i[keep], parallax[keep]
-    metres_per_px = distance / parallax / camera.fx
+    metres_per_px = distance / parallax / focal
     found = TiePoints(
         X_local=(P_i[keep] + P_j[keep]) / 2,
         sigma_m=_MATCH_SIGMA_PX * np.sqrt(2) * metres_per_px,

@@ -144,7 +144,8 @@ class ImageSoundings(NamedTuple):
     Attributes
     ----------
     soundings : the accepted ones.
-    line_uv : (M, 2) pixels along the whole line of light, gaps closed: what laser.mask is to erase.
+    line_uv : (M, 2) pixels along the whole line of light, gaps closed: what laser.mask is to erase, whether or not it
+        gave soundings.
     halfwidth_px : how far the light reaches to each side of line_uv.
     reason : empty, or why there are no soundings.
     agreement : of the two arms, or None where they are not both seen around their crossing.
@@ -215,7 +216,7 @@ def _sound_sheets(
 ) -> ImageSoundings:
     """`on_both_sheets`, and what else is to be known of the light: where it is to be erased, and whether arms agree."""
     soundings, line, small, reason = on_both_sheets(image_bgr, camera, light, parameters)
-    if reason:
+    if not len(line.uv):
         return nothing(reason)
     every = slice(None, None, small.row_step)
     whole = cross.whole_line(line.uv[every], line.arm[every], small.row_step, image_bgr.shape[:2])
@@ -223,7 +224,7 @@ def _sound_sheets(
     first, pitch = small.origin_uv, small.pitch_uv
     patch = (3.0, 3.0 * small.factor / small.row_step)
     glow = laser.glow(small.image, (whole - first) / pitch, reach / small.factor, patch) * pitch + first
-    return ImageSoundings(soundings, np.concatenate([whole, glow]), reach, "", agreement(soundings))
+    return ImageSoundings(soundings, np.concatenate([whole, glow]), reach, reason, agreement(soundings))
 
 
 def _apart(camera: Camera, light: Laser, line: line_profile.Line) -> NDArray[np.bool_]:
@@ -242,22 +243,25 @@ def _no_cross(points: int, on_cross: int) -> str:
 def _sound_paper(
     image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, parameters: LaserParameters
 ) -> ImageSoundings:
-    points = laser.detect(image_bgr, parameters)
-    if len(points.uv) < parameters.min_soundings:
+    points, reason = laser.detect(image_bgr, parameters), ""
+    if not len(points.uv):
         return nothing("no laser found")
-    sheets = sheets_at(camera, light, points.uv, parameters)
-    inverse_range = (1 / parameters.range_max_m, 1 / parameters.range_min_m)
-    found = cross.segment(points, image_bgr.shape[:2], sheets, inverse_range)
+    if len(points.uv) < parameters.min_soundings:
+        found, reason = cross.nowhere(points), "no laser found"
+    else:
+        sheets = sheets_at(camera, light, points.uv, parameters)
+        inverse_range = (1 / parameters.range_max_m, 1 / parameters.range_min_m)
+        found = cross.segment(points, image_bgr.shape[:2], sheets, inverse_range)
     told = np.flatnonzero(found.arm >= 0)
     soundings = triangulate(camera, light, points.uv[told], found.arm[told], points.sigma_px[told])
-    keep = reject_outliers(soundings, parameters)
-    if keep.sum() < parameters.min_soundings:
-        return nothing(_no_cross(len(points.uv), int(keep.sum())))
+    soundings = soundings.take(reject_outliers(soundings, parameters))
+    count = len(soundings.uv)
+    if count < parameters.min_soundings:
+        soundings, reason = no_soundings(), reason or _no_cross(len(points.uv), count)
     line = cross.whole_line(points.uv, found.arm, points.step_px, image_bgr.shape[:2])
     reach = _REACH_SIGMAS * float(np.median(points.width_px))
     line = np.concatenate([line, laser.glow(image_bgr, line, reach, (3.0 * points.step_px, 3.0 * points.step_px))])
-    soundings = soundings.take(keep)
-    return ImageSoundings(soundings, line, reach, "", agreement(soundings))
+    return ImageSoundings(soundings, line, reach, reason, agreement(soundings))
 
 
 def agreement(soundings: Soundings) -> Agreement | None:

@@ -22,6 +22,7 @@ Mask = NDArray[np.bool_]
 
 _GREEN: Final = 1
 _DARKEST: Final = 1e-4
+_GREY: Final = 1e-3  # channels that differ by no more have no colour
 _MOST_GAIN: Final = 24.0
 _SMOOTH_CELLS: Final = 1.0
 _FEW_IMAGES: Final = 4
@@ -85,10 +86,12 @@ def fit(light: Array32, range_m: Array32, exact: Mask) -> Water:
     share = range_m / typical
     law = _Law(np.zeros(3), np.zeros(3), 0.0, np.zeros(3), np.ones(2))
     pattern = np.zeros(light.shape[1:])
+    grey = not (np.abs(light - light[..., [_GREEN]]) > _GREY).any()  # no red to tell by whether there is water
     for _ in range(_ROUNDS):
         pattern = _pattern(light, share, law)
         law = _fit_law(light, pattern, share, exact)
-    wet = _in_water(law.colour)
+        law = _without_colour(law) if grey else law
+    wet = 1.0 if grey else _in_water(law.colour)
     balance = np.exp(wet * _white(law))
     balance *= np.exp(law.colour).mean() / (np.exp(law.colour) * balance).mean()
     return Water(
@@ -137,11 +140,11 @@ def _fit_law(light: Array32, pattern: Array, share: Array32, exact: Mask) -> _La
     known = exact & np.isfinite(even).all(-1)
     x, y = share[known].astype(float), np.log(np.maximum(even[known], _DARKEST))
     image = np.nonzero(known)[0]
-    if len(x) < _LEAST_IN_BIN:
+    members = _members(x)
+    if not members:
         colour = _median(np.log(np.maximum(even, _DARKEST)), axis=(0, 1, 2))
         return _Law(colour, np.zeros(3), 0.0, np.zeros(3), np.full(2, _PRIOR_ATTENUATION))
-    edges = np.quantile(x, np.linspace(0, 1, _BINS + 1)[1:-1])
-    bins = [_bin(x[here], y[here], dim[known][here], image[here]) for here in _members(np.digitize(x, edges))]
+    bins = [_bin(x[here], y[here], dim[known][here], image[here]) for here in members]
     at, level, ratio, contrast, dimmed, dark, count = (np.array(column) for column in zip(*bins, strict=True))
     sigma = [_spread(values, count, least) for values, least in ((level, _LEAST_SIGMA), (ratio, _LEAST_SIGMA_RATIO))]
     mean = _median(y, axis=0)
@@ -173,6 +176,12 @@ def _fit_law(light: Array32, pattern: Array, share: Array32, exact: Mask) -> _La
     return _Law(p[:3], p[3:6], float(p[6]), np.exp(mean) * p[7:10], sigma_ratio)
 
 
+def _without_colour(law: _Law) -> _Law:
+    """The law of green for all three."""
+    colour, attenuation, veil = (np.full(3, values[_GREEN]) for values in (law.colour, law.attenuation, law.veil))
+    return law._replace(colour=colour, attenuation=attenuation, veil=veil)
+
+
 def _off_dark(dark: Array, signal: Array, veil: Array) -> Array:
     """What the ratios (bins, 2) of the darkest cells are off those of as dark a seabed that is as grey as the rest."""
     left = np.exp(dark[:, :1]) - veil[:, [_GREEN]]
@@ -181,7 +190,11 @@ def _off_dark(dark: Array, signal: Array, veil: Array) -> Array:
     return dark[:, 1:] - (expected[:, (0, 2)] - expected[:, [_GREEN]])
 
 
-def _members(bins: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+def _members(x: Array) -> list[NDArray[np.intp]]:
+    """Which cells are in each bin of their range; without the bins that have too few."""
+    if len(x) < _LEAST_IN_BIN:
+        return []
+    bins = np.digitize(x, np.quantile(x, np.linspace(0, 1, _BINS + 1)[1:-1]))
     found = [np.flatnonzero(bins == k) for k in range(_BINS)]
     return [here for here in found if len(here) >= _LEAST_IN_BIN // 4]
 

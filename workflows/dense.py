@@ -72,9 +72,10 @@ def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
     camera, poses, (i, j) = m.job.calibration.camera, solution.poses, (pair.i.row, pair.j.row)
     known = np.concatenate([_ties(m, pair, solution).X_local, *(sounded(m, k, solution) for k in (pair.i, pair.j))])
     nothing = Made({}, {"cells": 0})
-    if not len(known):
+    axes = dense.rectified_axes(poses, i, j)
+    if not len(known) or axes is None:
         return nothing
-    depth = (known - poses.C_local[i]) @ poses.R_local_camera[i][:, 2]
+    depth = (known - poses.C_local[i]) @ axes[:, 2]
     least, most = np.quantile(depth, (_DEPTH_SHARE, 1 - _DEPTH_SHARE))
     margin = _DEPTH_MARGIN * float(np.median(depth))
     scale = _scale(m)

@@ -47,12 +47,11 @@ def extract_batch(job: Job, batch: Sequence[ImageTask]) -> list[Done]:
 def _extract(job: Job, image: ImageTask, read: Callable[[str], bytes]) -> Done:
     calibration = job.calibration
     light = calibration.laser if image.role != "texture" else None
-    parameters = [
-        image.role,
-        image.north_deg,
-        *stage(calibration.camera, job.parameters.laser, job.parameters.features),
-        light.model_dump(mode="json") if light else None,
-    ]
+    parameters = [image.role, *stage(calibration.camera)]
+    if light is not None:
+        parameters += stage(job.parameters.laser, light)
+    if image.role != "laser":
+        parameters += [*stage(job.parameters.features), image.north_deg]
 
     def make() -> Made:
         try:
@@ -93,8 +92,7 @@ def _verified(job: Job, path: str, expected: str, content: bytes, reduce: int = 
 
 
 def _measure(job: Job, image: ImageTask, light: Laser | None, bgr: np.ndarray) -> Made:
-    arrays, reason = {}, ""
-    erase = np.zeros(bgr.shape[:2], bool)
+    arrays, reason, line_uv = {}, "", np.zeros((0, 2))
     count, range_m, sigma_m, halfwidth_px, agreement = 0, None, None, 0.0, None
     if light is not None:
         found = triangulation.sound(bgr, job.calibration.camera, light, job.parameters.laser)
@@ -102,16 +100,17 @@ def _measure(job: Job, image: ImageTask, light: Laser | None, bgr: np.ndarray) -
         count, agreement = len(soundings.uv), found.agreement
         if count:
             range_m, sigma_m = float(np.median(soundings.X_camera[:, 2])), float(np.median(soundings.sigma_m))
-        erase = laser.mask(bgr.shape[:2], found.line_uv, found.halfwidth_px)
+        line_uv = found.line_uv
         arrays |= {
             "laser_uv": soundings.uv,
             "laser_arm": soundings.arm,
             "laser_X": soundings.X_camera,
             "laser_sigma": soundings.sigma_m,
-            "line_uv": found.line_uv,
+            "line_uv": line_uv,
         }
     feature_count = 0
     if image.role != "laser":
+        erase = laser.mask(bgr.shape[:2], line_uv, halfwidth_px)
         grey = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
         points = features.detect(grey, erase, job.parameters.features, image.north_rad)
         feature_count = len(points.uv)

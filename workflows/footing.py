@@ -2,17 +2,23 @@
 
 import hashlib
 import platform
+from contextlib import suppress
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
+from ..catalog.filesystems import ObjectStoreError
 from ..catalog.mission_files import MissionFiles
 from ..catalog.mission_inputs import MISSION
 from ..catalog.store import Store
 from ..schemas.problems import InvalidInput
 
-_LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "gtsam", "pyproj", "dask", "distributed")
+# what stored steps compute with; Open3D comes as one of two
+COMPUTING: Final = (
+    *("numpy", "scipy", "opencv-python-headless", "gtsam", "pyproj", "shapely", "contourpy"),
+    *("open3d-cpu", "open3d"),
+)
 
 
 class Footing(NamedTuple):
@@ -34,6 +40,15 @@ class OtherFooting(RuntimeError):
     """A worker runs other code, or does not see the mission or the store."""
 
 
+def installed(*names: str) -> list[tuple[str, str]]:
+    """Name and version of those distributions that are installed."""
+    found = []
+    for name in names:
+        with suppress(PackageNotFoundError):
+            found.append((name, version(name)))
+    return found
+
+
 @cache
 def software() -> tuple[tuple[str, str], ...]:
     """Digest of our code, and versions of Python and of the libraries that compute."""
@@ -42,7 +57,8 @@ def software() -> tuple[tuple[str, str], ...]:
         for path in sorted((root / layer).glob("*.py")):
             sha.update(f"{layer}/{path.name}".encode() + path.read_bytes())
     python = ".".join(platform.python_version_tuple()[:2])
-    return ("seamosaic", sha.hexdigest()[:12]), ("python", python), *((name, version(name)) for name in _LIBRARIES)
+    libraries = installed(*COMPUTING, "dask", "distributed")
+    return ("seamosaic", sha.hexdigest()[:12]), ("python", python), *libraries
 
 
 def why_not(mission_url: str, store: Store, footing: Footing) -> str:
@@ -56,6 +72,8 @@ def why_not(mission_url: str, store: Store, footing: Footing) -> str:
     try:
         seen = MissionFiles(mission_url)
         seen.read(MISSION, None, [])
+    except ObjectStoreError:  # which does not answer now; the task that comes will say so if it lasts
+        raise
     except (InvalidInput, OSError) as error:
         return f"it does not see the mission ({error})"
     if seen.digests.get(MISSION) != footing.mission_sha256:

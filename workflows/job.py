@@ -6,7 +6,6 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from importlib.metadata import version
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -17,13 +16,12 @@ from ..catalog.store import Entry, Store, digest
 from ..schemas.base import Model
 from ..schemas.calibration import Calibration
 from ..schemas.parameters import Parameters
-from .footing import Footing, stand
+from .footing import COMPUTING, Footing, installed, stand
 
 log = logging.getLogger("seamosaic")
 
 _OURS = __package__.rpartition(".")[0] if __package__ else ""
 _FOLLOWED = tuple(f"{_OURS}.{name}" for name in ("tasks", "catalog.image", "schemas.calibration"))
-_LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "gtsam", "pyproj")
 
 
 class Job(NamedTuple):
@@ -70,7 +68,7 @@ def code_version(*modules: ModuleType) -> str:
     for module in modules:
         _follow(module, seen)
     text = "".join(inspect.getsource(seen[name]) for name in sorted(seen))
-    libraries = ",".join(f"{name}={version(name)}" for name in _LIBRARIES)
+    libraries = ",".join(f"{name}={number}" for name, number in installed(*COMPUTING))
     return hashlib.sha256((text + libraries).encode()).hexdigest()[:16]
 
 
@@ -97,6 +95,11 @@ def array_digest(*arrays: NDArray) -> str:
         sha.update(f"{array.dtype.str}{array.shape}".encode())
         sha.update(np.ascontiguousarray(array).tobytes())
     return sha.hexdigest()
+
+
+def rounded_digest(*arrays: NDArray) -> str:
+    """The same to nine digits after the point: the last bits of what was computed are the processor's."""
+    return array_digest(*(np.round(array, 9) + 0.0 for array in arrays))  # no -0
 
 
 def once(

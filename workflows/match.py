@@ -13,7 +13,7 @@ from ..tasks.adjust import Link
 from ..tasks.navigation import NavigationPrior, Poses, RelativePrior, relative, with_half_turn
 from ..tasks.rotations import angle_between_deg
 from . import extract
-from .job import Done, Job, Made, array_digest, code_version, load, once, stage
+from .job import Done, Job, Made, code_version, load, once, rounded_digest, stage
 
 STEP = "match"
 VERSION = code_version(sys.modules[__name__])
@@ -34,7 +34,8 @@ class Wanted(NamedTuple):
 
     range_m : height above the seabed where the laser does not tell. lit_i, lit_j : rows of laser images that sound for
     either. next : whether j was taken right after i, so that they overlap whatever navigation says.
-    free : whether the adjustment contradicts navigation here, and stands for it.
+    free : whether the adjustment contradicts navigation here, and stands for it. turned : which of the two it has the
+    other way round than navigation.
     """
 
     i: int
@@ -44,6 +45,7 @@ class Wanted(NamedTuple):
     lit_j: tuple[int, ...] = ()
     next: bool = False
     free: bool = False
+    turned: tuple[bool, bool] = (False, False)
 
     @property
     def rows(self) -> tuple[int, ...]:
@@ -142,8 +144,8 @@ def _readable(wanted: Wanted, extracted: Mapping[int, Done]) -> Wanted:
 
 
 def _match(job: Job, pair: PairTask, keys: Sequence[str], entry: Callable[[int], Entry]) -> Done:
-    known = [] if pair.poses is None else [array_digest(*pair.poses)]
-    known += [array_digest(*step) for step in (pair.prior, *(lit.step for lit in (*pair.lit_i, *pair.lit_j))) if step]
+    steps = [pair.poses, pair.prior, *(lit.step for lit in (*pair.lit_i, *pair.lit_j))]
+    known = [rounded_digest(*step) for step in steps if step]
     wanted = pair.wanted
     parameters = [
         *stage(job.calibration.camera, job.parameters.match),
@@ -152,6 +154,7 @@ def _match(job: Job, pair: PairTask, keys: Sequence[str], entry: Callable[[int],
         len(pair.lit_i),
         wanted.next,
         wanted.free,
+        wanted.turned,
     ]
 
     def make() -> Made:
@@ -168,6 +171,8 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
     """
     if "feature_uv" not in a.arrays or "feature_uv" not in b.arrays:
         return Made({}, {"model": "", "matches": 0, "inliers": 0})
+    if pair.wanted.turned[0] != pair.wanted.turned[1]:
+        b = _half_turned(b)
     ranges = [range_m for range_m in (a.info["range_m"], b.info["range_m"]) if range_m]
     at = float(np.mean(ranges)) if ranges else pair.wanted.range_m
     matched = _matches(job, a, b) if pair.poses is None else _expected(job, pair, pair.poses, a, b, at)
@@ -199,8 +204,8 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
             "scale_sigma": found.scale_sigma if found.metric else None,
             "matches": count,
             "inliers": len(agreed),
-            "turned": list(turned),
-            "free": free or pair.wanted.free,
+            "turned": [now != before for now, before in zip(turned, pair.wanted.turned, strict=True)],
+            "free": free or (pair.wanted.free and found.metric),
         },
     )
 
@@ -247,7 +252,7 @@ def _named(a: Entry, b: Entry, numbers: np.ndarray) -> Matched:
 def _expected(job: Job, pair: PairTask, poses: Poses, a: Entry, b: Entry, range_m: float) -> Matched:
     """Matches that lie where navigation expects them."""
     lens = job.calibration.camera
-    margin_px = pair.margin_m / range_m * max(lens.fx, lens.fy)
+    margin_px = pair.margin_m / range_m * camera.focal_px(lens, range_m)
     of_a, of_b = _features(a), _features(b)
     uv = [pairs.expected(lens, of.uv.astype(float), poses, k, 1 - k, range_m) for k, of in enumerate((of_a, of_b))]
     seen = [np.flatnonzero(pairs.inside(lens, each, margin_px)) for each in uv]
@@ -262,7 +267,7 @@ def _guided(job: Job, found: motion.Motion, known: np.ndarray, a: Entry, b: Entr
     lens = job.calibration.camera
     of_a, of_b = _features(a), _features(b)
     x_a, x_b = (camera.normalised(lens, side.uv.astype(float), range_m) for side in (of_a, of_b))
-    focal_px = range_m / camera.ground_sample_distance(lens, range_m)
+    focal_px = camera.focal_px(lens, range_m)
     return guided.match(of_a, of_b, x_a, x_b, known, found, focal_px)
 
 
@@ -270,7 +275,7 @@ def _estimate(
     job: Job, prior: RelativePrior | None, matched: Matched, soundings: PairSoundings, range_m: float
 ) -> motion.Motion | None:
     lens = job.calibration.camera
-    focal_px = range_m / camera.ground_sample_distance(lens, range_m)
+    focal_px = camera.focal_px(lens, range_m)
     slopes = camera.normalised(lens, matched.uv_i, range_m), camera.normalised(lens, matched.uv_j, range_m)
     (X_a, sigma_a), (X_b, sigma_b) = soundings
     shared = max(sigma_a, sigma_b) / range_m

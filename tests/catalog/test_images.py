@@ -1,4 +1,5 @@
 import hashlib
+import io
 import threading
 from pathlib import Path
 
@@ -131,3 +132,43 @@ def test_reading_ahead_says_of_which_image_it_failed(tmp_path: Path) -> None:
             read("gone")
         with pytest.raises(MissingImage, match="b cannot be read"):
             read("b")
+
+
+def jpeg(picture: np.ndarray, **options) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "JPEG", quality=90, **options)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("restarts", [0, 1])
+@pytest.mark.parametrize("kind", ["zeros", "noise"])
+def test_a_jpeg_that_is_damaged_inside_is_refused(kind: str, restarts: int) -> None:
+    rng = np.random.default_rng(2)
+    content = bytearray(jpeg(rng.integers(0, 255, (64, 96, 3), np.uint8), restart_marker_rows=restarts))
+    decode(bytes(content), CAMERA)
+    middle = slice(len(content) // 2, len(content) // 2 + 2000)
+    content[middle] = bytes(2000) if kind == "zeros" else rng.bytes(2000)
+    with pytest.raises(UnreadableImage, match="file is damaged"):
+        decode(bytes(content), CAMERA)
+
+
+@pytest.mark.parametrize("options", [{}, {"optimize": True}, {"progressive": True}, {"comment": b"\xff\x01" * 50}])
+@pytest.mark.parametrize("level", [0, 117, 255])
+def test_a_plain_jpeg_is_not_damaged(level: int, options: dict) -> None:
+    camera = CAMERA.model_copy(update={"width": 1600, "height": 1200})
+    for shape in ((1200, 1600), (1200, 1600, 3)):
+        content = jpeg(np.full(shape, level, np.uint8), **options)
+        if "optimize" in options:
+            assert bytes(64) in content
+        assert decode(content + bytes(200), camera).mean() == level
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_twelve_bits_in_sixteen_are_refused_and_dark_is_not(smooth: np.ndarray, suffix: str) -> None:
+    for picture in (smooth, smooth[..., 1]):
+        with pytest.raises(UnreadableImage, match=r"12 bits in a 16-bit file.*scale every image by 16"):
+            decode(encoded(suffix, picture.astype(np.uint16) * 16), CAMERA)
+        assert decode(encoded(suffix, picture.astype(np.uint16)), CAMERA).max() == 0
+        np.testing.assert_array_equal(
+            decode(encoded(suffix, picture.astype(np.uint16) * 256), CAMERA)[..., 1], smooth[..., 1]
+        )

@@ -54,6 +54,9 @@ def test_normalised_is_exact_at_its_range_for_a_flat_port():
 def test_ground_sample_distance_and_outline():
     assert abs(camera.ground_sample_distance(BROWN, 3.0) - 3.0 / 1584.3) < 1e-6
     assert abs(camera.ground_sample_distance(FLAT_PORT, 3.0) * 1584.3 * 1.34 / 3.0 - 1) < 0.02
+    assert abs(camera.focal_px(BROWN, 3.0) - 1584.3) < 1e-3
+    for range_m in (1.0, 3.0, 10.0):
+        assert 0 < abs(camera.focal_px(FLAT_PORT, range_m) / (1584.3 * 1.34) - 1) < 0.012
     border = camera.outline(BROWN, 3)
     assert border.shape == (8, 2)
     np.testing.assert_allclose(border[0], [0, 0])

@@ -79,6 +79,33 @@ def test_the_laser_and_plain_or_burnt_ground_are_left_out():
         assert not np.isfinite(found).any()
 
 
+def test_depths_are_along_the_rectified_axis_whose_baseline_leans():
+    lens, poses = LENSES["brown"], scenes.cameras([[0, 0, 0], [0.7, 0, -0.25]], tilt_deg=0)
+    axes = dense.rectified_axes(poses, 0, 1)
+    assert axes is not None
+    X = scenes.seabed(0.0, size_m=1.5, count=400)
+    depth = (X - poses.C_local[0]) @ axes[:, 2]
+    made = dense.rectify(lens, poses, 0, 1, (depth.min(), depth.max()), 1.0)
+    assert made is not None
+    x = [(X - poses.C_local[k]) @ axes[:, 0] / depth * made.focal_px for k in (0, 1)]
+    disparity = x[0] - x[1] - made.shift
+    assert 0 <= disparity.min() < 1
+    assert disparity.max() < made.disparities <= disparity.max() + 17
+    # along the camera's own axis all of it is 3 m away
+    assert np.ptp(depth) > 0.2
+
+
+def test_where_depths_differ_much_pixels_are_coarser():
+    lens, poses = LENSES["brown"], scenes.cameras([[0, 0, 0], [0.5, 0, 0]], tilt_deg=0)
+    near, far = 0.8, 4.0
+    made = dense.rectify(lens, poses, 0, 1, (near, far), 1.0)
+    assert made is not None
+    assert made.disparities == 256
+    assert 0.4 < made.focal_px / lens.fx < 0.8
+    last = made.focal_px * made.base_m / near - made.shift
+    assert last < made.disparities
+
+
 def test_pairs_that_say_nothing_of_depth_are_refused():
     lens = LENSES["brown"]
     for second in ([0, 0, 0], [0, 0, 0.8], [6, 0, 0]):

@@ -197,3 +197,16 @@ def test_glow_is_the_green_light_that_no_row_has_a_peak_of_and_that_touches_the_
     assert not erased[apart].any()
     assert len(laser.glow(np.ascontiguousarray(image[..., 1]), line, 9.0, (3, 3))) == 0
     assert len(laser.glow(image, np.zeros((0, 2)), 9.0, (3, 3))) == 0
+
+
+def test_green_organisms_that_touch_the_line_are_no_glow():
+    image, truth = line_image(noise=1.0, background=100.0)
+    leaf, sponge = np.s_[180:240, 290:360], np.s_[380:430, 250:600]
+    image[leaf] = (image[leaf] * [0.5, 0.9, 0.5]).astype(np.uint8)
+    image[sponge] = (image[sponge] * [0.8, 1.2, 0.8]).astype(np.uint8)
+    line = np.column_stack([truth, np.arange(len(truth))])
+    found = laser.glow(image, line, 6.0, (3, 3))
+    erased = laser.mask(image.shape[:2], np.concatenate([line, found]), 6.0)
+    usual = laser.mask(image.shape[:2], line, 6.0)
+    np.testing.assert_array_equal(erased[leaf], usual[leaf])
+    assert 1.5 * usual[sponge].mean() < erased[sponge].mean() < 0.4

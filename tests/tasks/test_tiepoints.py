@@ -41,6 +41,17 @@ def test_rays_that_miss_each_other_are_left_out():
     assert len(found.X_local) == len(points) - 100
 
 
+def test_pixels_behind_a_port_are_those_in_water():
+    port = {"distance": 0.035, "thickness": 0.012, "water_index": 1.34}
+    lens = Camera.model_validate({**LENS.model_dump(), "model": "flat-port", "distortion": (), "port": port})
+    points, poses, _ = _scene(0.0)
+    seen = [(points - poses.C_local[k]) @ poses.R_local_camera[k] for k in (0, 1)]
+    found = tiepoints.triangulate(lens, *(project(lens, X) for X in seen), poses, 0, 1, POSE_PX)
+    pinhole = tiepoints.triangulate(LENS, *(_pixels(points, poses, k) for k in (0, 1)), poses, 0, 1, POSE_PX)
+    assert len(found.X_local) == len(pinhole.X_local) == len(points)
+    assert 0.98 < 1.34 * np.median(found.metres_per_px) / np.median(pinhole.metres_per_px) < 1.02
+
+
 def test_no_depth_without_parallax():
     points, poses, (uv_i, uv_j) = _scene(0.0)
     near = poses._replace(C_local=np.array([[0, 0, 0], [0, 0.01, 0]]))

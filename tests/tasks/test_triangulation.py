@@ -133,6 +133,26 @@ def test_reasons_are_given_where_there_are_no_soundings():
     assert tri.sound(image, camera, LIGHT, demanding).reason == "no laser found"
 
 
+@pytest.mark.parametrize(
+    ("method", "change"),
+    [
+        ("sheets", {"min_soundings": 5000}),
+        ("paper", {"min_soundings": 5000}),
+        ("paper", {"range_min_m": 5.0, "range_max_m": 6.0}),
+    ],
+)
+def test_light_that_gives_no_soundings_is_erased_all_the_same(method: str, change: dict):
+    camera, parameters = CAMERAS["brown"], PARAMETERS.model_copy(update={"method": method})
+    image = cross_image(camera, 2.9, 60.0)
+    usual = tri.sound(image, camera, LIGHT, parameters)
+    none = tri.sound(image, camera, LIGHT, parameters.model_copy(update=change))
+    assert none.reason != ""
+    assert none.agreement is None
+    assert len(none.soundings.uv) == 0
+    erased, as_usual = (laser.mask(image.shape[:2], found.line_uv, found.halfwidth_px) for found in (none, usual))
+    assert (erased & as_usual).sum() > 0.9 * as_usual.sum()
+
+
 @pytest.mark.parametrize("turned_mm", [0.0, 15.0])
 def test_arms_agree_unless_the_calibration_is_wrong(turned_mm: float):
     camera = CAMERAS["brown"]

@@ -150,3 +150,25 @@ def test_an_unlit_or_lone_image_is_left_nearly_as_it_is():
     few = water.fit(light, range_m, exact).light
     many = water.fit(*survey(rng, rng.uniform(2.6, 2.8, 40))).light
     assert np.log(few).std() < 0.6 * np.log(many).std()
+
+
+@pytest.mark.parametrize("count", [3, 19, 20, 30, 48, 59, 60, 80])
+def test_few_known_cells_are_enough_not_to_fail(count):
+    light, range_m, _ = survey(np.random.default_rng(5), [2.4, 2.7, 3.1])
+    exact = np.zeros(range_m.shape, bool)
+    exact.flat[np.random.default_rng(6).choice(exact.size, count, replace=False)] = True
+    gain, veil = water.tone(model := water.fit(light, range_m, exact), model.light, range_m)
+    assert (gain > 0).all()
+    assert np.isfinite(veil).all()
+
+
+def test_a_grey_camera_is_evened_and_stays_grey():
+    rng = np.random.default_rng(7)
+    light, range_m, exact = survey(rng, rng.uniform(2, 3.5, 60))
+    model = water.fit(np.repeat(light[..., 1:2], 3, -1), range_m, exact)
+    ground = ranges_of(np.linspace(2, 3.4, 30), rng, 0.02)
+    raw = np.repeat(through_water(np.full(3, 0.4), ground)[..., 1:2], 3, -1)
+    found = corrected(model, raw, ground)
+    assert np.ptp(found, axis=-1).max() == 0
+    spread = [values[..., 0].std() / values[..., 0].mean() for values in (raw, found)]
+    assert spread[1] < 0.35 * spread[0]
