@@ -1,19 +1,23 @@
 """Opens an archive: archive.yaml, the missions that it names, and where their products are."""
 
-import glob
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from fnmatch import fnmatchcase
 from typing import Any, Final, NamedTuple
+
+from fsspec import AbstractFileSystem
+from fsspec.implementations.local import LocalFileSystem
 
 from ..schemas.archive import Archive
 from ..schemas.expressions import MISSION_NAMES, Row, compile_expression
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.yaml_input import load_model, load_parameters
-from .filesystems import asking, connect
+from .filesystems import ObjectStoreError, absolute, asking, connect, entries
 from .mission_inputs import MISSION
 
 ARCHIVE: Final = "archive.yaml"
+_MAGIC: Final = "*?["
 
 
 class OpenedArchive(NamedTuple):
@@ -22,7 +26,8 @@ class OpenedArchive(NamedTuple):
     Attributes
     ----------
     url : its folder. config : its archive.yaml. products : the folder or URL of the products.
-    missions : folders or URLs of the missions, sorted. parameters : text of the parameters' file; None without.
+    missions : folders, without links, or URLs of the missions, sorted. parameters : text of the parameters' file; None
+        without.
     selects : says of a row of MISSION_NAMES whether the mission is processed.
     overrides : the same for each of the archive's overrides, with its parameters.
     """
@@ -37,10 +42,19 @@ class OpenedArchive(NamedTuple):
 
 
 def is_archive(url: str) -> bool:
-    """Whether a folder or URL holds an archive.yaml."""
+    """Whether a folder or URL holds an archive.yaml.
+
+    Raises
+    ------
+    ObjectStoreError
+        If the store does not answer.
+    """
     try:
         filesystem, path = connect(url)
-        return filesystem.isfile(f"{path.rstrip('/')}/{ARCHIVE}")
+        with asking(filesystem, url):
+            return filesystem.info(f"{path.rstrip('/')}/{ARCHIVE}")["type"] == "file"
+    except ObjectStoreError:
+        raise
     except (OSError, ValueError, ImportError):  # said better where it is opened
         return False
 
@@ -53,19 +67,20 @@ def open_archive(url: str) -> OpenedArchive:
     InvalidInput
         If there is none, something in it is wrong, or no folder with a mission.yaml matches.
     """
-    url = url.rstrip("/") if "://" in url else os.path.abspath(url)
+    url = absolute(url)
     config = load_model(_read(f"{url}/{ARCHIVE}", ARCHIVE), ARCHIVE, Archive)
     text = None
     if config.parameters is not None:
         text = _read(_within(url, config.parameters), "parameters").decode("utf-8", "replace")
         load_parameters(text, config.parameters)
-    missions = sorted({mission for pattern in config.missions for mission in _matching(_within(url, pattern, url))})
+    missions = sorted({mission for pattern in config.missions for mission in _matching(url, pattern)})
     if not missions:
         expected = f"folders with a {MISSION} that match {', '.join(config.missions)}"
         raise InvalidInput([Problem(ARCHIVE, None, "missions", "none", expected, f"Patterns are relative to {url}.")])
     overrides = tuple((_compiled(one.where, "overrides"), dict(one.set)) for one in config.overrides)
     selects = (lambda row: True) if config.select is None else _compiled(config.select, "select")
-    opened = OpenedArchive(url, config, _within(url, config.products), tuple(missions), text, selects, overrides)
+    products = absolute(_within(url, config.products))
+    opened = OpenedArchive(url, config, products, tuple(missions), text, selects, overrides)
     for _, given in overrides:
         parameters_of(opened, {}, given)
     return opened
@@ -97,26 +112,65 @@ def as_arguments(settings: Sequence[dict[str, Any]]) -> list[str]:
     return [f"{name}={str(value).lower() if isinstance(value, bool) else value}" for name, value in merged.items()]
 
 
-def _within(url: str, path: str, escaped: str = "") -> str:
-    """A path of archive.yaml as a path or URL; with `escaped`, fit for globs where the archive's name is not."""
-    if "://" in path or os.path.isabs(path):
-        return path
-    folder = glob.escape(escaped) if escaped and "://" not in escaped else url
-    return f"{folder}/{path.rstrip('/')}"
+def _within(url: str, path: str) -> str:
+    """A path of archive.yaml as a path or URL."""
+    return path if _is_whole(path) else f"{url}/{path.rstrip('/')}"
 
 
-def _matching(pattern: str) -> list[str]:
-    """Folders or URLs with a mission.yaml that match a glob."""
-    filesystem, path = connect(pattern)
-    with asking(filesystem, pattern):
-        found = [str(one).rpartition("/")[0] for one in filesystem.glob(f"{path}/{MISSION}")]
-    return [filesystem.unstrip_protocol(one) for one in found] if "://" in pattern else found
+def _is_whole(path: str) -> bool:
+    return "://" in path or os.path.isabs(path)
+
+
+def _matching(url: str, pattern: str) -> list[str]:
+    """Folders or URLs with a mission.yaml that match a glob, the archive's own name taken as it is."""
+    filesystem, path = connect(pattern if _is_whole(pattern) else url)
+    parts = [part for part in (path if _is_whole(pattern) else pattern).split("/") if part not in ("", ".")]
+    start = ("/" if path.startswith("/") else "") if _is_whole(pattern) else f"{path.rstrip('/')}/"
+    fixed = next((i for i, part in enumerate(parts) if any(sign in part for sign in _MAGIC)), len(parts))
+    found = _folders(filesystem, start + "/".join(parts[:fixed]), parts[fixed:], pattern)
+    missions = [folder for folder in dict.fromkeys(found) if _is_mission(filesystem, folder)]
+    if isinstance(filesystem, LocalFileSystem):
+        return [absolute(one) for one in missions]
+    return [filesystem.unstrip_protocol(one) for one in missions]
+
+
+def _folders(filesystem: AbstractFileSystem, folder: str, parts: Sequence[str], pattern: str) -> Iterator[str]:
+    """Folders below one that match the parts of a glob, also behind links; `**` does not follow these."""
+    if not parts:
+        yield folder
+        return
+    if parts[0] == "**":
+        yield from _folders(filesystem, folder, parts[1:], pattern)
+    try:
+        found = entries(filesystem, folder, pattern)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    for path, info in found.items():
+        if parts[0] == "**":
+            if info["type"] == "directory":
+                yield from _folders(filesystem, path, parts, pattern)
+        elif (info["type"] == "directory" or info.get("islink")) and fnmatchcase(path.rpartition("/")[2], parts[0]):
+            yield from _folders(filesystem, path, parts[1:], pattern)
+
+
+def _is_mission(filesystem: AbstractFileSystem, folder: str) -> bool:
+    """Whether there is a mission.yaml; one that may not be read is said to be so where it is opened."""
+    try:
+        with asking(filesystem, folder):
+            return filesystem.info(f"{folder}/{MISSION}")["type"] == "file"
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except PermissionError:
+        return True
 
 
 def _read(url: str, asked: str) -> bytes:
     filesystem, path = connect(url)
     try:
-        content = filesystem.cat_file(path)
+        with asking(filesystem, url):
+            content = filesystem.cat_file(path)
+    except ObjectStoreError:
+        raise
     except OSError as error:
         remedy = f"An archive is a folder with {ARCHIVE}; docs/archive.md shows one."
         found = "nothing" if isinstance(error, FileNotFoundError) else str(error)

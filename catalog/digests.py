@@ -8,7 +8,7 @@ from typing import Any, BinaryIO, NamedTuple, cast
 
 from fsspec import AbstractFileSystem
 
-from .filesystems import ObjectStoreError, asking
+from .filesystems import ObjectStoreError, asking, open_parts
 from .image_headers import HEADER_BYTES, TAIL_BYTES, Header, read_header
 
 _BLOCK = 4 * 1024 * 1024
@@ -62,9 +62,15 @@ def are_known(files: Sequence[tuple[str, Mapping[str, Any]]], known: Mapping[str
     return all(file_key(path, info) in (known or {}) for path, info in files)
 
 
-def peek_images(fs: AbstractFileSystem, files: Sequence[tuple[str, Mapping[str, Any]]]) -> list[Inspection]:
-    """Read only the first and last bytes of each file; the digests stay empty."""
-    return _all(_peek, fs, [path for path, _ in files])
+def peek_images(
+    fs: AbstractFileSystem, files: Sequence[tuple[str, Mapping[str, Any]]], known: Mapping[str, Any] | None = None
+) -> list[Inspection]:
+    """Read only the first and last bytes of each file, and nothing of one that is known; the digests stay empty."""
+    keys = [file_key(path, info) for path, info in files]
+    found = {i: _recall(known[str(key)])._replace(sha256="") for i, key in enumerate(keys) if known and key in known}
+    unread = [i for i in range(len(files)) if i not in found]
+    found |= zip(unread, _all(_peek, fs, [files[i][0] for i in unread]), strict=True)
+    return [found[i] for i in range(len(files))]
 
 
 def _all(
@@ -101,7 +107,7 @@ def _inspect(fs: AbstractFileSystem, path: str) -> Inspection:
 
 def _peek(fs: AbstractFileSystem, path: str) -> Inspection:
     try:
-        with asking(fs, path), cast(BinaryIO, fs.open(path, "rb")) as file:
+        with asking(fs, path), cast(BinaryIO, open_parts(fs, path)) as file:
             head = file.read(HEADER_BYTES)
             file.seek(max(0, file.seek(0, io.SEEK_END) - TAIL_BYTES))
             return Inspection("", read_header(head, file.read(TAIL_BYTES), file))

@@ -27,6 +27,11 @@ _ANSWERS: Final = (FileNotFoundError, FileExistsError, PermissionError, IsADirec
 _FOREIGN: Final = (("botocore.exceptions", "BotoCoreError"), ("aiohttp", "ClientError"))
 
 
+_REMEDY: Final = "Check that the object store runs, AWS_ENDPOINT_URL, and the credentials (docs/clusters.md)."
+# the directory of a stored result and its record are at its end: one read
+_PART_BYTES: Final = 64 * 1024
+
+
 class ObjectStoreError(OSError):
     """An object store did not answer, or with an error of its own, however often it was asked."""
 
@@ -41,6 +46,11 @@ def connect(url: str) -> tuple[AbstractFileSystem, str]:
     """The file system of a URL and the path in it."""
     fs, path = fsspec.url_to_fs(url, **_options(url))
     return fs, cast(str, path)
+
+
+def absolute(url: str | os.PathLike[str]) -> str:
+    """A URL or path in the one spelling by which it is known: of this machine a path, absolute and without links."""
+    return str(url).rstrip("/") if is_remote(url) else os.path.realpath(connect(str(url))[1])
 
 
 def place(url: str | os.PathLike[str]) -> Folder:
@@ -78,17 +88,46 @@ def asking(fs: AbstractFileSystem, what: str) -> Iterator[None]:
         return
     try:
         yield
-    except _ANSWERS:
+    except (ObjectStoreError, *_ANSWERS):
         raise
     except Exception as error:
         if isinstance(error, (OSError, *_foreign())):
-            raise ObjectStoreError(f"{what}: {str(error) or type(error).__name__}") from error
+            reason = (str(error) or type(error).__name__).rstrip(".")
+            raise ObjectStoreError(f"{what}: {reason}. {_REMEDY}") from error
         raise
 
 
 def _foreign() -> tuple[type[BaseException], ...]:
     """The bases of what the clients raise that is no OSError, of those clients that are loaded."""
     return tuple(getattr(sys.modules[module], name) for module, name in _FOREIGN if module in sys.modules)
+
+
+def settle(path: str | os.PathLike[str]) -> None:
+    """Have a file or folder of this machine written to its disk, so that a power cut leaves it whole."""
+    try:
+        handle = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError:
+        if os.path.isfile(path):  # not every file system does that for a folder
+            raise
+
+
+def entries(fs: AbstractFileSystem, folder: str, what: str) -> dict[str, dict[str, Any]]:
+    """What is in a folder, by path. One request; every trouble is raised, which fsspec's find and glob pass over."""
+    with asking(fs, what):
+        found: list[dict[str, Any]] = fs.ls(folder, detail=True)
+    named = ((info["name"].rstrip("/"), info) for info in found)
+    return {path: info for path, info in named if path != folder}
+
+
+def open_parts(fs: AbstractFileSystem, path: str) -> Any:
+    """A file to read parts of: nothing else of it is fetched from an object store."""
+    if isinstance(fs, LocalFileSystem):
+        return fs.open(path, "rb")
+    return fs.open(path, "rb", block_size=_PART_BYTES, cache_type="blockcache")
 
 
 def write_whole(url: str, data: bytes, scratch: str) -> None:

@@ -10,7 +10,7 @@ from uuid import uuid4
 
 from fsspec.implementations.local import LocalFileSystem
 
-from .filesystems import ObjectStoreError, asking, connect, create
+from .filesystems import ObjectStoreError, asking, connect, create, settle
 
 # file systems without hard links: exFAT, some network shares
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
@@ -72,10 +72,12 @@ def _put(temporary: str, path: str, data: bytes, new: bool) -> None:
     try:
         with open(temporary, "wb") as file:
             file.write(data)
+        settle(temporary)
         if new:
             _link(temporary, path, data)
         else:
             os.replace(temporary, path)
+        settle(os.path.dirname(path))
     finally:
         with contextlib.suppress(FileNotFoundError):
             os.remove(temporary)
@@ -89,6 +91,7 @@ def _link(temporary: str, path: str, data: bytes) -> None:
             raise
         with open(path, "xb") as file:
             file.write(data)
+        settle(path)
 
 
 def remove(url: str) -> None:

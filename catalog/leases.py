@@ -7,6 +7,7 @@ a conditional put in an object store); nothing stays behind that a person would 
 that share an archive should agree to a few seconds (NTP).
 """
 
+import logging
 import os
 import secrets
 import socket
@@ -19,10 +20,14 @@ from typing import Any, Final, NamedTuple, Self
 
 from . import json_files
 
+log = logging.getLogger("seamosaic")
+
 FOLDER: Final = ".leases"
 TERM_S: Final = 120.0
 _BEATS_A_TERM: Final = 5
 _ASK_AGAIN_S: Final = 0.2
+_TAKEN_OVER: Final = "another run took over its lease; see that this machine's clock is right"
+_LATE: Final = "its lease could not be renewed for {:g} s; see that this machine reaches and may write the products"
 _TAKEN: Final[set["Lease"]] = set()  # by this process, and not given back
 
 
@@ -65,11 +70,11 @@ class Lease:
 
     Attributes
     ----------
-    holder : us. lost : set when it could not be renewed within its term or was taken by another.
+    holder : us. lost : set when it could not be renewed within its term or was taken by another. why : which of these.
     """
 
     def __init__(self, url: str, holder: Holder):
-        self.url, self.holder, self.lost = url, holder, threading.Event()
+        self.url, self.holder, self.lost, self.why = url, holder, threading.Event(), ""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._beat, name=f"lease {url}", daemon=True)
 
@@ -94,7 +99,9 @@ class Lease:
         term, renewed = self.holder.term_s, time.monotonic()
         while not self._ended.wait(term / _BEATS_A_TERM):
             with suppress(OSError):
-                if time.monotonic() - renewed > term or not self.is_ours():
+                late = time.monotonic() - renewed > term
+                if late or not self.is_ours():
+                    self.why = _LATE.format(term) if late else _TAKEN_OVER
                     self.lost.set()
                     return
                 json_files.write_json(self.url, self.holder._replace(heartbeat=time.time())._asdict())
@@ -123,6 +130,7 @@ def take(out: str, mission_id: str, purpose: str = "run", term_s: float = TERM_S
     Busy
         If it is held by another. What prunes is waited for, as that takes seconds.
     """
+    said = False
     while True:
         try:
             return _take(_folder(out, mission_id), purpose, term_s, shared)
@@ -130,6 +138,9 @@ def take(out: str, mission_id: str, purpose: str = "run", term_s: float = TERM_S
             prunes = busy.holder is not None and busy.holder.purpose == "prune"
             if not shared and (purpose == "prune" or not prunes):
                 raise
+            if prunes and not said:
+                log.info("mission=%s step=%s waiting for %s", mission_id, "lease", busy)
+                said = True
             time.sleep(_ASK_AGAIN_S)
 
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, cast
 
@@ -11,7 +12,7 @@ from ..schemas.mission import Mission
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.yaml_document import Document
 from .digests import file_key, sha256
-from .filesystems import ObjectStoreError, asking, connect, is_remote
+from .filesystems import ObjectStoreError, absolute, asking, connect, entries, is_remote
 
 _MAGIC = "*?["
 
@@ -63,6 +64,8 @@ class MissionFiles:
             problem = asked or Problem(name, None, "", "", "", "Give the folder that holds it.")
             problems.append(problem._replace(found=f"no file {name} in {self.url}", expected="the file"))
             return None
+        except ObjectStoreError:
+            raise
         except OSError as error:
             remedy = "Check its permissions and the connection."
             problems.append(Problem(name, None, "", f"an unreadable file ({error})", "the file", remedy))
@@ -88,8 +91,13 @@ class MissionFiles:
         return {name: entry for name, entry in sorted(found.items()) if _matches(name.split("/"), parts)}
 
     def keys(self) -> dict[str, str | None]:
-        """Path, size and time of change of every file, as of now, by relative path; None where that is not told."""
-        return {name: file_key(path, info) for name, (path, info) in self._files("", None).items()}
+        """Path, size and time of change of every file, as of now, by relative path.
+
+        None where that is not told, and for a folder that may not be looked into.
+        """
+        closed: list[str] = []
+        keys = {name: file_key(path, info) for name, (path, info) in self._files("", None, closed).items()}
+        return keys | dict.fromkeys(closed)
 
     def folder_of(self, pattern: str) -> list[str]:
         """Names of the files in the folder in which a pattern looks, for a message."""
@@ -99,21 +107,40 @@ class MissionFiles:
         return sorted(self._files(folder, 1))
 
     def _files(
-        self, folder: str, depth: int | None, through: tuple[str, ...] = ()
+        self, folder: str, depth: int | None, closed: list[str] | None = None, through: tuple[str, ...] = ()
     ) -> dict[str, tuple[str, dict[str, Any]]]:
-        """Files below a folder; without a depth also behind links to folders, but for those they were come through."""
+        """Files below a folder; without a depth also behind links to folders, but for those they were come through.
+
+        closed : is given the folders that may not be looked into; without it, such a folder is an error.
+        """
         base = f"{self.root}/{folder}".rstrip("/")
-        with asking(self.fs, self.url):
-            found: dict[str, dict[str, Any]] = self.fs.find(base, maxdepth=depth, detail=True)  # type: ignore[assignment]
-            links = [path for path, info in found.items() if info.get("islink")]
-            found |= {path: self._behind(path, found[path]) for path in links}
-        start = len(self.root) + 1
-        files = {path[start:]: (path, info) for path, info in found.items() if info["type"] != "directory"}
-        through = (*through, os.path.realpath(base))
-        for path in links if depth is None else ():
-            if found[path]["type"] == "directory" and os.path.realpath(path) not in through:
-                files |= self._files(path[start:], None, through)
+        through, start = (*through, os.path.realpath(base)), len(self.root) + 1
+        files: dict[str, tuple[str, dict[str, Any]]] = {}
+        waiting = [(base, 1)]
+        while waiting:
+            place, level = waiting.pop()
+            for path, entry in self._entries(place, place == base, closed).items():
+                info = self._behind(path, entry) if entry.get("islink") else entry
+                if info["type"] != "directory":
+                    files[path[start:]] = (path, info)
+                elif not entry.get("islink"):
+                    waiting += [(path, level + 1)] if depth is None or level < depth else []
+                elif depth is None and os.path.realpath(path) not in through:
+                    files |= self._files(path[start:], None, closed, through)
         return files
+
+    def _entries(self, folder: str, base: bool, closed: list[str] | None) -> dict[str, dict[str, Any]]:
+        """What is in a folder; nothing if it does not exist and is the base, where files are looked for."""
+        try:
+            return entries(self.fs, folder, self.url)
+        except (FileNotFoundError, NotADirectoryError):
+            if not base:
+                raise
+        except PermissionError:
+            if closed is None:
+                raise
+            closed.append(folder[len(self.root) + 1 :])
+        return {}
 
     def _behind(self, path: str, link: dict[str, Any]) -> dict[str, Any]:
         """The entry of what a link of a local disk leads to, which changes while the link does not."""
@@ -122,34 +149,32 @@ class MissionFiles:
 
 
 def _connect(url: str) -> tuple[AbstractFileSystem, str]:
+    found = "nothing"
     try:
-        fs, root = connect(url)
-        with asking(fs, url):
-            exists = fs.isdir(root)
+        fs, root = connect(absolute(url))
+        with suppress(FileNotFoundError, NotADirectoryError), asking(fs, url):
+            if fs.isdir(root) or fs.info(root)["type"] == "directory":  # isdir takes any trouble for a no
+                return fs, root
+            found = "a file"
     except (ImportError, ValueError) as error:
         remedy = "Give a folder, or a URL that fsspec reads; its driver has to be installed."
         raise InvalidInput([Problem(url, None, "", f"no access ({error})", "a mission folder", remedy)]) from None
+    except ObjectStoreError:
+        raise
     except OSError as error:
         raise InvalidInput([no_access(url, error, "a mission folder")]) from None
-    if not exists:
-        found = "a file" if fs.exists(root) else "nothing"
-        remedy = "Give the folder that holds mission.yaml."
-        raise InvalidInput([Problem(url, None, "", found, "a mission folder", remedy)])
-    return fs, root
+    raise InvalidInput([Problem(url, None, "", found, "a mission folder", "Give the folder that holds mission.yaml.")])
 
 
 def no_access(url: str, error: OSError, expected: str) -> Problem:
-    """Why a folder or an object store cannot be used, and what to look at."""
-    reason = str(error).removeprefix(f"{url}: ")
-    if isinstance(error, ObjectStoreError):
-        remedy = "Check that the object store runs, AWS_ENDPOINT_URL, and the credentials (docs/clusters.md)."
-    elif isinstance(error, FileNotFoundError) and is_remote(url):
+    """Why a folder cannot be used, or a place in an object store that answers, and what to look at."""
+    if isinstance(error, FileNotFoundError) and is_remote(url):
         remedy = "Make the bucket, or correct its name."
     elif is_remote(url):
         remedy = "Check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they may do there (docs/clusters.md)."
     else:
         remedy = "Check its permissions and the connection."
-    return Problem(url, None, "", f"no access ({reason})", expected, remedy)
+    return Problem(url, None, "", f"no access ({error})", expected, remedy)
 
 
 def _matches(parts: Sequence[str], patterns: Sequence[str]) -> bool:

@@ -6,12 +6,15 @@ from datetime import datetime
 from typing import Any, Final, NamedTuple
 
 from fsspec import AbstractFileSystem
+from fsspec.implementations.local import LocalFileSystem
 
 from . import json_files, leases
-from .filesystems import asking, connect
+from .filesystems import ObjectStoreError, asking, connect
 
 STEPS: Final = "steps"
 _SCRATCH: Final = ".tmp"  # of Store
+_BATCH: Final = 1000  # what S3 removes at once
+_MAGIC: Final = "*?["  # which fsspec would expand
 _MODIFIED: Final = ("mtime", "LastModified", "last_modified", "updated", "created")
 
 
@@ -30,13 +33,15 @@ class Pruned(NamedTuple):
     Attributes
     ----------
     before, freed : bytes of all intermediate results, and of those that are gone. entries : how many these were.
-    busy : missions that were left alone because a run is at work on them.
+    busy : missions that were left alone because a run is at work on them. failed : missions of which something could
+        not be freed, and why.
     """
 
     before: int
     freed: int
     entries: int
     busy: tuple[str, ...]
+    failed: tuple[str, ...] = ()
 
 
 def prune(out: str, keep_bytes: float, *, dry_run: bool = False, term_s: float = leases.TERM_S) -> Pruned:
@@ -51,16 +56,30 @@ def prune(out: str, keep_bytes: float, *, dry_run: bool = False, term_s: float =
     missions = {entry.mission_id for entry in entries}
     busy = {mission_id for mission_id in missions if leases.holder(out, mission_id)}
     chosen = _choose([entry for entry in entries if entry.mission_id not in busy], before - keep_bytes)
-    freed = [entry for some in chosen.values() for entry in some]
-    if not dry_run:
-        for mission_id, some in chosen.items():
-            try:
-                with leases.take(out, mission_id, "prune", term_s):
-                    _remove(filesystem, [entry.path for entry in some])
-            except leases.Busy:
-                busy.add(mission_id)
-                freed = [entry for entry in freed if entry.mission_id != mission_id]
-    return Pruned(before, sum(entry.size for entry in freed), len(freed), tuple(sorted(busy)))
+    freed, failed = [], []
+    for mission_id, some in chosen.items():
+        try:
+            gone, why = (some, "") if dry_run else _free(filesystem, out, mission_id, some, term_s)
+        except leases.Busy:
+            busy.add(mission_id)
+            continue
+        freed += gone
+        failed += [f"{mission_id}: {why}"] if why else []
+    return Pruned(before, sum(entry.size for entry in freed), len(freed), tuple(sorted(busy)), tuple(failed))
+
+
+def _free(
+    filesystem: AbstractFileSystem, out: str, mission_id: str, some: Sequence[Entry], term_s: float
+) -> tuple[list[Entry], str]:
+    """Remove results of a mission: those that are gone, and why others are not."""
+    try:
+        with leases.take(out, mission_id, "prune", term_s) as lease:
+            why = _remove(filesystem, [entry.path for entry in some], lease)
+            left = {entry.path for entry in _entries(filesystem, out, mission_id)}  # a store may refuse in silence
+    except OSError as error:
+        return [], str(error)
+    gone = [entry for entry in some if entry.path not in left]
+    return gone, why or ("" if len(gone) == len(some) else f"{len(some) - len(gone)} results cannot be deleted")
 
 
 def _entries(filesystem: AbstractFileSystem, out: str, mission_id: str) -> list[Entry]:
@@ -89,7 +108,19 @@ def _is_half(path: str) -> bool:
     return path.split("/")[-2] == _SCRATCH
 
 
-def _remove(filesystem: AbstractFileSystem, paths: Sequence[str]) -> None:
-    for path in paths:
-        with asking(filesystem, path), suppress(FileNotFoundError):
-            filesystem.rm_file(path)
+def _remove(filesystem: AbstractFileSystem, paths: Sequence[str], lease: leases.Lease) -> str:
+    """Remove files, many with one request where that can be, as long as the lease is ours; why some are not removed."""
+    why, single = "", isinstance(filesystem, LocalFileSystem) or any(sign in paths[0] for sign in _MAGIC)
+    count = 1 if single else _BATCH
+    for start in range(0, len(paths), count):
+        if lease.lost.is_set():
+            return lease.why
+        batch = list(paths[start : start + count])
+        try:
+            with asking(filesystem, batch[0]), suppress(FileNotFoundError):
+                filesystem.rm_file(batch[0]) if single else filesystem.rm(batch)
+        except ObjectStoreError:
+            raise
+        except OSError as error:  # of one file: the others can go
+            why = why or str(error)
+    return why

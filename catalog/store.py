@@ -22,7 +22,7 @@ from fsspec import AbstractFileSystem
 from fsspec.implementations.local import LocalFileSystem
 from numpy.typing import NDArray
 
-from .filesystems import ObjectStoreError, asking, connect, write_whole
+from .filesystems import ObjectStoreError, asking, connect, open_parts, write_whole
 from .runs import is_dead, run_name
 
 R = TypeVar("R")
@@ -32,8 +32,6 @@ _UNREADABLE = (
     *(FileNotFoundError, zipfile.BadZipFile, zlib.error, struct.error),
     *(ValueError, KeyError, EOFError, RuntimeError, OverflowError),  # of damaged sizes, names and flags
 )
-# the directory of an entry and its record are at its end: one read of an object store
-_TAIL_BYTES = 64 * 1024
 
 
 def digest(step: str, code_version: str, inputs: Iterable[str], parameters: Any) -> str:
@@ -81,7 +79,7 @@ class Store(NamedTuple):
         fs, path = connect(self.path(step, key))
 
         def read() -> dict[str, Any]:
-            with _open(fs, path) as file, zipfile.ZipFile(file) as archive:
+            with open_parts(fs, path) as file, zipfile.ZipFile(file) as archive:
                 return _read_info(archive)[1]
 
         return _unless_damaged(fs, path, read)
@@ -158,12 +156,6 @@ def _unless_damaged(fs: AbstractFileSystem, path: str, read: Callable[[], R]) ->
         if error.errno != errno.EINVAL:  # of a place before the file's beginning
             raise
         return None
-
-
-def _open(fs: AbstractFileSystem, path: str) -> Any:
-    if isinstance(fs, LocalFileSystem):
-        return fs.open(path, "rb")
-    return fs.open(path, "rb", block_size=_TAIL_BYTES, cache_type="blockcache")
 
 
 def _pack(arrays: Mapping[str, NDArray], info: Mapping[str, Any], compress: bool | Collection[str]) -> bytes:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple, Self
 
 from . import publishing
-from .filesystems import Folder, place
+from .filesystems import Folder, place, settle
 from .publishing import PROVENANCE, digest_of
 from .runs import LEASE_S, is_dead, run_name
 
@@ -114,10 +114,13 @@ class VersionWriter:
         if newest is not None and newest.digest == self._digest:
             return Path(str(newest.path))
         number = next_number(self._out, self._mission)
+        for written in (*self.folder.rglob("*"), self.folder):  # else a power cut may leave a version of empty files
+            settle(written)
         while True:
             path = folder / f"v{number}"
             try:
                 self.folder.rename(path)
+                settle(folder)
                 return path
             except OSError:
                 if not path.exists():

@@ -238,6 +238,8 @@ def prune(
         _console.print_json(json.dumps(pruned._asdict()))
     else:
         _print_pruned(pruned, dry_run)
+    if pruned.failed:
+        raise typer.Exit(FAILED)
 
 
 def _print_pruned(pruned: Any, dry_run: bool) -> None:
@@ -246,3 +248,5 @@ def _print_pruned(pruned: Any, dry_run: bool) -> None:
     _console.print(Text(f"{gigabytes} of intermediate results {said}, {pruned.entries} of them"))
     for mission_id in pruned.busy:
         _console.print(Text(f"left alone, as a run is at work on it: {mission_id}"))
+    for why in pruned.failed:
+        _console.print(Text(f"not freed: {why}"))

@@ -97,10 +97,31 @@ def run_archive(
     made = _process_all(archive, todo, options)
     limit, pruned = archive.config.keep_gb, None
     if limit is not None:
-        pruned = pruning.prune(archive.products, limit * _GIGABYTE, term_s=archive.config.lease_s)
+        pruned = _prune(archive, limit * _GIGABYTE)
+    _publish_all(archive)
     order = {url: number for number, url in enumerate(archive.missions)}
     outcomes = tuple(sorted([*settled, *made], key=lambda one: order[one.url]))
     return Summary(archive.url, started, _now(), outcomes, pruned)
+
+
+def _prune(archive: OpenedArchive, keep_bytes: float) -> Pruned | None:
+    """Missions are made by now, whatever cannot be freed."""
+    try:
+        pruned = pruning.prune(archive.products, keep_bytes, term_s=archive.config.lease_s)
+    except OSError as error:
+        log.warning("archive=%s step=%s intermediate results were not freed: %s", archive.url, "prune", error)
+        return None
+    for why in pruned.failed:
+        log.warning("archive=%s step=%s not freed: %s", archive.url, "prune", why)
+    return pruned
+
+
+def _publish_all(archive: OpenedArchive) -> None:
+    """The catalogue once more as a whole: without missions that are gone, and with those of runs at the same time."""
+    try:
+        stac.update_catalog(archive.products, archive.config.title)
+    except OSError as error:
+        log.warning("archive=%s step=%s the catalogue was not written: %s", archive.url, "catalogue", error)
 
 
 def _now() -> str:
@@ -127,10 +148,10 @@ def _publish(archive: OpenedArchive, state: MissionState) -> None:
 class _Child:
     """A mission being processed. held : what is given back when it ends."""
 
-    def __init__(self, archive: OpenedArchive, state: MissionState, options: Options, lost: threading.Event):
+    def __init__(self, archive: OpenedArchive, state: MissionState, options: Options, lease: leases.Lease):
         assert state.parameters is not None
         context = multiprocessing.get_context(_METHOD)
-        self.state, self.lost, self.held, self._archive = state, lost, ExitStack(), archive
+        self.state, self.lease, self.held, self._archive = state, lease, ExitStack(), archive
         self._started = time.monotonic()
         self._answers, sender = context.Pipe(duplex=False)
         given = (sender, state.url, archive.products, state.parameters, options, dict(os.environ))
@@ -145,22 +166,25 @@ class _Child:
 
     def stop(self) -> None:
         self.process.terminate()
+        self._end()
+        self.held.close()
+
+    def _end(self) -> None:
         self.process.join(_PATIENCE_S)
         self.process.kill()
         self.process.join()
-        self.held.close()
 
     def outcome(self) -> Outcome:
-        """What became of it, once its process has ended; written down and published."""
-        self.process.join()
+        """What became of it, once its process has ended or is about to; written down and published."""
+        self._end()
         seconds = round(time.monotonic() - self._started, 1)
         try:
             answer = self._answers.recv()
         except EOFError:
             answer = (FAILED, _fate(self.process.exitcode))
         self._answers.close()
-        if self.lost.is_set():
-            answer = (FAILED, "another run took over its lease; see that this machine's clock is right")
+        if self.lease.lost.is_set() and answer[0] != "done":
+            answer = (FAILED, self.lease.why)
         with self.held:
             try:
                 return self._settle(answer, seconds)
@@ -204,7 +228,7 @@ def _process_all(archive: OpenedArchive, todo: Iterable[MissionState], options: 
                 begun = _begin(archive, queue.pop(0), options)
                 (children if isinstance(begun, _Child) else outcomes).append(begun)  # type: ignore[arg-type]
             wait([child.process.sentinel for child in children], timeout=_WAIT_S)
-            for child in [one for one in children if not one.process.is_alive() or one.lost.is_set()]:
+            for child in [one for one in children if not one.process.is_alive() or one.lease.lost.is_set()]:
                 child.process.terminate()  # if it is alive, it has lost its lease
                 children.remove(child)
                 outcomes.append(child.outcome())
@@ -226,7 +250,7 @@ def _begin(archive: OpenedArchive, state: MissionState, options: Options) -> _Ch
         now = archive_states.assess(archive, state.url, ours=True)
         if now.state not in TO_DO:
             return _settled(archive, now)
-        child = _Child(archive, now, options, lease.lost)
+        child = _Child(archive, now, options, lease)
         child.held = held.pop_all()  # only now: whatever happens before gives the lease back
         return child
 

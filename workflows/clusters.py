@@ -7,6 +7,7 @@ from typing import Any
 import dask.config
 from distributed import LocalCluster
 from distributed.deploy.cluster import Cluster as Running
+from distributed.system import MEMORY_LIMIT
 
 from ..schemas.cluster import Cluster
 from ..schemas.problems import InvalidInput, Problem
@@ -69,6 +70,8 @@ def _local(described: Cluster) -> LocalCluster:
     }
     if described.memory is not None:
         options["memory_limit"] = described.memory
+    elif described.adapt is not None and MEMORY_LIMIT:  # Dask would share it among the first workers alone
+        options["memory_limit"] = MEMORY_LIMIT // described.adapt.max
     for _ in range(_STARTS - 1):
         with suppress(RuntimeError):  # of a worker that was killed while it started
             return LocalCluster(**options)

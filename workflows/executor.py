@@ -166,7 +166,9 @@ def open_executor(scheduler: str | None, workers: int | None, cluster: Cluster |
     cluster : what cluster of its own; None for processes of this machine.
     """
     dask.config.set(_SETTINGS)
-    if scheduler in ("sync", "threads"):
+    if scheduler == "sync":  # one task at a time
+        yield LocalExecutor(scheduler, 1)
+    elif scheduler == "threads":
         yield LocalExecutor(scheduler, clusters.local(workers).workers or 1)
     elif scheduler is None:
         described = cluster or clusters.local(workers)

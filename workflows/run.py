@@ -15,7 +15,7 @@ import numpy as np
 from dask.delayed import Delayed, delayed
 
 from ..catalog import leases, memory, records
-from ..catalog.filesystems import Folder, ObjectStoreError, is_remote, place
+from ..catalog.filesystems import Folder, absolute, is_remote
 from ..catalog.mission_files import no_access
 from ..catalog.mission_inputs import MISSION
 from ..catalog.missions import OpenedMission
@@ -104,7 +104,7 @@ def run(
     NothingToMap
         If no image gave a sounding or a match.
     """
-    out, mission_url = _absolute(out), _absolute(mission_url)
+    out, mission_url = absolute(out), absolute(mission_url)
     if not is_remote(out) and Path(out).exists() and not Path(out).is_dir():
         remedy = "Give -o a folder, which need not exist."
         raise InvalidInput([Problem(out, None, "", "a file", "a folder", remedy)])
@@ -162,10 +162,6 @@ def _process(state: Session, asked: Request, out: str) -> RunResult:
     return RunResult(path, new, quality, steps, remembered.digest if remembered else None)
 
 
-def _absolute(url: str | Path) -> str:
-    return str(url).rstrip("/") if is_remote(url) else str(place(url).resolve())
-
-
 def _lease(out: str, mission_id: str) -> leases.Lease:
     with _reaching(out):
         return leases.take(out, mission_id, shared=True)
@@ -200,7 +196,7 @@ def _renew(store: Store, mark: str, ended: threading.Event) -> None:
 def _reaching(out: str) -> Iterator[None]:
     try:
         yield
-    except (PermissionError, FileNotFoundError, ObjectStoreError) as error:
+    except (PermissionError, FileNotFoundError) as error:
         raise InvalidInput([no_access(out, error, "a folder that can be written")]) from error
 
 
@@ -269,10 +265,12 @@ def _close_loops(
     more = plan.chained_pairs if made.prior is None else plan.misplaced_pairs
     known = [(i, j) for i, j, done in matched if made.prior is None or done.info["model"]]
     for turn in range(_LOOP_ROUNDS if made.prior is None else 1):
-        poses = _solution(job, adjustments[-1]).poses
+        poses, turned = _solution(job, adjustments[-1]).poses, _solution(job, adjustments[-1]).turned.tolist()
         wanted = more(made, state.opened, job.parameters, poses, ranges, known)
         if not wanted:
             break
+        if made.prior is not None:  # matched by the adjusted poses
+            wanted = [pair._replace(turned=(turned[pair.i], turned[pair.j])) for pair in wanted]
         tasks = _match_tasks(state, wanted, plan.adjusted_prior(made, poses), extracts, batch_of, f"match-{turn}")
         again = [pair for part in compute(state, "loops", tasks) for pair in part]
         tried = {(i, j) for i, j, _ in again}

@@ -53,12 +53,18 @@ def take(before: Newest | None, folder: Path, part: str, made_from: str) -> bool
     """
     if before is None or before.provenance.parts.get(part) != made_from:
         return False
-    files = {name: sha for name, sha in before.provenance.outputs.items() if fnmatch(name, PARTS[part])}
+    outputs = before.provenance.outputs.items()
+    files = {name: sha for name, sha in outputs if fnmatch(name, PARTS[part]) and _is_inside(name)}
     copied = all(_copy(before.folder / name, folder / name, sha) for name, sha in files.items())
     if not copied:
         for name in files:
             (folder / name).unlink(missing_ok=True)
     return copied and bool(files)
+
+
+def _is_inside(name: str) -> bool:
+    """Whether a name leads nowhere but into the version's folder; the file that gives it may have been edited."""
+    return not (name.startswith("/") or ".." in name.replace("\\", "/").split("/"))
 
 
 def _copy(source: Folder, target: Path, sha256: str) -> bool:
