@@ -8,6 +8,8 @@ from pyproj.exceptions import CRSError
 
 from ..schemas.problems import Problem
 
+_SCALE_TOLERANCE = 0.01
+
 
 class Place(NamedTuple):
     """Where a CRS was asked for, for the messages.
@@ -122,6 +124,9 @@ def _projected_problems(crs: pyproj.CRS, place: Place) -> list[Problem]:
         kind = "a geographic CRS, in degrees" if crs.is_geographic else f"a {crs.type_name}"
         remedy = "Give a projected CRS, such as the UTM zone of the place, or leave the key out."
         return [place.problem(f"{crs.name}, {kind}", "a projected CRS in metres", remedy)]
+    if any(axis.direction.lower() == "west" for axis in crs.axis_info[:2]):
+        remedy = "Choose a CRS of the place that counts east and north, such as its UTM zone."
+        return [place.problem(f"{crs.name}, which counts west and south", "x to the east, y to the north", remedy)]
     units = {axis.unit_name for axis in crs.axis_info[:2] if axis.unit_conversion_factor != 1.0}
     if units:
         remedy = "Choose the metric sister of this CRS; products are in metres."
@@ -162,6 +167,20 @@ def _check_position(
         problems.append(place.problem(crs.name, f"a CRS that covers the mission ({where})", remedy))
     elif area is not None and not _covers(area, latitude, longitude):
         warnings.append(f"the mission ({where}) lies outside the area of use of {crs.name} ({area.name})")
+    else:
+        warnings += _scale_warnings(crs, latitude, longitude)
+
+
+def _scale_warnings(crs: pyproj.CRS, latitude: float, longitude: float) -> list[str]:
+    """A map whose metres are not metres gives wrong areas and slopes."""
+    factors = pyproj.Proj(crs).get_factors(longitude, latitude)
+    scale = factors.areal_scale**0.5
+    if abs(scale - 1) <= _SCALE_TOLERANCE:
+        return []
+    return [
+        f"a metre on the seabed is {scale:.3f} m in {crs.name} here: areas, slopes and distances measured on the map "
+        "are wrong by that; the UTM zone of the place would be right"
+    ]
 
 
 def _covers(area, latitude: float, longitude: float) -> bool:

@@ -5,18 +5,16 @@ a look at the mission as a whole. It may be deleted at any time; the next run th
 """
 
 import hashlib
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-
 from ..schemas.problems import InvalidInput
 from . import json_files
 from .digests import sha256
+from .filesystems import absolute
 from .mission_files import MissionFiles
-from .missions import OpenedMission, open_mission
+from .missions import OpenedMission, open_mission, span
 from .store import digest
 
 FOLDER: Final = ".missions"
@@ -94,8 +92,7 @@ class Memory(NamedTuple):
 
 
 def _place(url: str, out: str) -> str:
-    whole = url if "://" in url else os.path.abspath(url)
-    return f"{out.rstrip('/')}/{FOLDER}/{hashlib.sha256(whole.encode()).hexdigest()[:24]}.json"
+    return f"{out.rstrip('/')}/{FOLDER}/{hashlib.sha256(absolute(url).encode()).hexdigest()[:24]}.json"
 
 
 def recall(url: str, out: str) -> Memory:
@@ -145,6 +142,8 @@ def _remember(url: str, out: str, memory: Memory, opened: OpenedMission, keys: M
 
 
 def _span(opened: OpenedMission) -> tuple[str, str]:
-    times = opened.frames["time"].values
-    times = times[~np.isnat(times)].astype("datetime64[s]")
-    return (f"{times.min()}Z", f"{times.max()}Z") if len(times) else ("", "")
+    found = span(opened.frames)
+    if found is None:
+        return "", ""
+    start, end = (f"{time.astype('datetime64[s]')}Z" for time in found)
+    return start, end

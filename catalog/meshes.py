@@ -25,7 +25,6 @@ def write_ply(
     vertices: NDArray[np.floating],
     triangles: NDArray[np.integer],
     colours: NDArray[np.uint8] | None = None,
-    uv: NDArray[np.floating] | None = None,
     comments: Sequence[str] = (),
 ) -> None:
     """Write a binary little-endian PLY.
@@ -35,16 +34,12 @@ def write_ply(
     vertices : (N, 3) x east, y north, z up, metres from the local origin.
     triangles : (T, 3) indices of vertices.
     colours : (N, 3) RGB.
-    uv : (N, 2) texture coordinates; stored as s, t with t up, as PLY readers expect.
     comments : header lines, such as the CRS and the offset of the origin.
     """
     fields = [(name, "<f4") for name in "xyz"]
-    fields += [(name, "<f4") for name in "st"] if uv is not None else []
     fields += [(name, "u1") for name in ("red", "green", "blue")] if colours is not None else []
     points = np.zeros(len(vertices), fields)
     points["x"], points["y"], points["z"] = np.asarray(vertices).T
-    if uv is not None:
-        points["s"], points["t"] = uv[:, 0], 1 - uv[:, 1]
     if colours is not None:
         points["red"], points["green"], points["blue"] = colours.T
     faces = np.zeros(len(triangles), [("count", "u1"), ("indices", "<i4", 3)])

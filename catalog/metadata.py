@@ -28,7 +28,7 @@ _SOFTWARE: Final = (
     *("open3d-cpu", "open3d"),
 )
 _PROJECTION: Final = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
-_FILE: Final = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
+FILE_EXTENSION: Final = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
 _EDGE_STEPS: Final = 16
 _MULTIHASH_SHA256: Final = "1220"
 
@@ -37,6 +37,11 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file, hexadecimal."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def multihash(sha256: str) -> str:
+    """A SHA-256 as the file extension of STAC writes it."""
+    return _MULTIHASH_SHA256 + sha256
 
 
 def output_digests(folder: str | os.PathLike[str]) -> dict[str, str]:
@@ -115,7 +120,7 @@ def write_stac_item(
     item = {
         "type": "Feature",
         "stac_version": "1.0.0",
-        "stac_extensions": [_PROJECTION, _FILE],
+        "stac_extensions": [_PROJECTION, FILE_EXTENSION],
         "id": f"{mission_id}-v{version_number}",
         "bbox": bbox,
         "geometry": geometry,
@@ -159,7 +164,7 @@ def _asset(root: Path, product: Product) -> dict[str, Any]:
         "type": product.media_type,
         "roles": [product.role],
         "file:size": path.stat().st_size,
-        "file:checksum": _MULTIHASH_SHA256 + sha256_of(path),
+        "file:checksum": multihash(sha256_of(path)),
     }
     if path.suffix == ".tif":
         with rasterio.open(path) as file:

@@ -121,8 +121,8 @@ def _consistency_problems(inputs: MissionInputs, mission: Mission, document: Doc
     return problems
 
 
-def input_warnings(inputs: MissionInputs, images: list[str]) -> list[str]:
-    """What is allowed but worth a second look."""
+def input_warnings(inputs: MissionInputs, images: list[str], vertical: str | None) -> list[str]:
+    """What is allowed but worth a second look. vertical : the vertical CRS, if there is one."""
     mission, warnings = inputs.mission, []
     if mission is None:
         return []
@@ -131,14 +131,14 @@ def input_warnings(inputs: MissionInputs, images: list[str]) -> list[str]:
         warnings.append("neither navigation nor laser: the scale of the products is unknown")
     if mission.navigation is None and roles == {"texture", "laser"}:
         warnings.append("laser images cannot be placed between their neighbours without navigation")
-    if mission.tide is not None and mission.vertical_datum is None:
+    if mission.tide is not None and vertical is None:
         warnings.append("a tide is given but no vertical_datum: the products cannot say to what heights refer")
     if inputs.calibration is not None and inputs.calibration.unknown_parameters:
         names = ", ".join(inputs.calibration.unknown_parameters[:3])
         warnings.append(f"covariance in {mission.calibration} of what it does not have, passed over: {names}")
-    if mission.vertical_datum is not None and mission.tide is None and mission.navigation is not None:
+    if vertical is not None and mission.tide is None:
         warnings.append(
-            "a vertical_datum is given but no tide: depths below the sea surface are taken as heights of that datum"
+            "a vertical datum is given but no tide: depths below the sea surface are taken as heights of that datum"
         )
     if inputs.times is not None:
         names = {name for image in images for name in (image, image.rpartition("/")[2])}

@@ -46,6 +46,17 @@ class OpenedMission(NamedTuple):
     warnings: list[str]
 
 
+def span(frames: xarray.Dataset) -> tuple[np.datetime64, np.datetime64] | None:
+    """First and last exposure of the images that count, of all where none does; None without a time.
+
+    A rejected image may be one whose clock was wrong.
+    """
+    times = frames["time"].values
+    known, counts = ~np.isnat(times), (frames["status"] == "").values
+    times = times[known & counts] if (known & counts).any() else times[known]
+    return (times.min(), times.max()) if len(times) else None
+
+
 def open_mission(
     url: str,
     digests: MutableMapping[str, Any] | None = None,
@@ -62,8 +73,8 @@ def open_mission(
     url : a folder, or any URL that fsspec reads.
     digests : what earlier runs learnt of the images, by path, size and time of change, so that a rerun does not
         read them all again; added to. Its values are plain lists, fit for JSON.
-    hashed : False to look at the images' headers only, for a quick check; `sha256` is empty then. None to do so
-        unless all of them are known by `digests`.
+    hashed : False to look at the headers only, of images that `digests` does not know, for a quick check; `sha256`
+        is empty then. None to do so unless all of them are known.
     smooth_s : half the window over which depth, altitude, roll and pitch are smoothed, seconds; 0 for not at all.
     level_floor : the seabed is flat, so that altitudes are smoothed together with depths.
     shift_s : seconds added to navigation times besides the mission's own time_offset.
@@ -84,7 +95,7 @@ def open_mission(
     listed = [(image.path, image.info) for image in images]
     # What is wrong anyway is said without reading gigabytes first.
     quick = problems or not (are_known(listed, digests) if hashed is None else hashed)
-    inspections = peek_images(files.fs, listed) if quick else inspect_images(files.fs, listed, digests)
+    inspections = peek_images(files.fs, listed, digests) if quick else inspect_images(files.fs, listed, digests)
     if inputs.navigation is not None and smooth_s > 0:
         inputs = inputs._replace(navigation=smoothed(inputs.navigation, smooth_s, level_floor))
     if mission.navigation is not None and shift_s:
@@ -104,7 +115,7 @@ def open_mission(
         vertical=systems.vertical,
         input_digests=dict(files.digests),
         warnings=[
-            *input_warnings(inputs, [image.image for image in images]),
+            *input_warnings(inputs, [image.image for image in images], systems.vertical),
             *systems.warnings,
             *(problem.found for problem in frames.rejections),
             *frames.warnings,

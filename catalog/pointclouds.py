@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 SCALE_M: Final = 1e-4
 _SEABED: Final = 40  # ASPRS class "bathymetric point"
-_PLAIN, _COLOURED = 6, 7
+_FORMAT: Final = 6
 _EXTRA: Final = (
     laspy.ExtraBytesParams("frame", "int32", "row of trajectory.csv, from 0"),
     laspy.ExtraBytesParams("arm", "uint8", "laser sheet, from 0"),
@@ -30,13 +30,12 @@ class SoundingsWriter:
     ----------
     crs_wkt : projected, compound or engineering CRS.
     offset : (3,) map coordinates near the soundings; coordinates are stored as 0.1 mm steps from it.
-    coloured : whether `write` is given colours.
     """
 
-    def __init__(self, path: str | os.PathLike[str], crs_wkt: str, offset: NDArray[np.float64], coloured: bool = False):
-        self.path, self._coloured = Path(path), coloured
+    def __init__(self, path: str | os.PathLike[str], crs_wkt: str, offset: NDArray[np.float64]):
+        self.path = Path(path)
         self._temporary = self.path.with_name(f".{self.path.name}.{uuid4().hex[:8]}.laz")
-        header = laspy.LasHeader(version="1.4", point_format=_COLOURED if coloured else _PLAIN)
+        header = laspy.LasHeader(version="1.4", point_format=_FORMAT)
         header.scales, header.offsets = np.full(3, SCALE_M), np.asarray(offset, float)
         header.generating_software = "seamosaic"
         header.add_extra_dims(list(_EXTRA))
@@ -55,7 +54,6 @@ class SoundingsWriter:
         frame: NDArray[np.integer],
         arm: NDArray[np.integer],
         sigma_m: NDArray[np.floating],
-        rgb: NDArray[np.uint8] | None = None,
     ) -> None:
         """Add soundings.
 
@@ -65,10 +63,7 @@ class SoundingsWriter:
         frame : (N,) row of trajectory.csv.
         arm : (N,) index of the laser sheet.
         sigma_m : (N,) 1-sigma along the ray, metres.
-        rgb : (N, 3) uint8; needed if, and only if, the file is coloured.
         """
-        if (rgb is not None) != self._coloured:
-            raise ValueError(f"{self.path.name} was opened {'with' if self._coloured else 'without'} colours")
         if not len(X_map):
             return
         points = laspy.ScaleAwarePointRecord.zeros(len(X_map), header=self._header)
@@ -76,9 +71,6 @@ class SoundingsWriter:
         points["frame"], points["arm"], points["sigma"] = frame, arm, sigma_m
         points["classification"] = np.full(len(X_map), _SEABED, np.uint8)
         points["return_number"] = points["number_of_returns"] = np.ones(len(X_map), np.uint8)
-        if rgb is not None:
-            # LAS colours are 16 bits wide
-            points["red"], points["green"], points["blue"] = rgb.T.astype(np.uint16) * 257
         self._writer.write_points(points)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

@@ -16,8 +16,10 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio import Affine
 from rasterio.crs import CRS
+from rasterio.enums import Resampling as Nearest
 from rasterio.io import DatasetWriter
 from rasterio.shutil import copy as gdal_copy
+from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 NODATA_M: Final = -9999.0
@@ -327,6 +329,23 @@ def summarise(path: str | os.PathLike[str]) -> Summary:
             counts += np.bincount(bins, minlength=_HISTOGRAM_BINS)
     middle = int(np.searchsorted(np.cumsum(counts), cells / 2))
     return Summary(cells, float(low), float(high), float(low + middle * span / (_HISTOGRAM_BINS - 1)))
+
+
+def covered_share(path: str | os.PathLike[str], picture: str | os.PathLike[str]) -> float | None:
+    """Share of a raster's cells with a value in whose middle a picture on a grid of its own has a pixel.
+
+    The picture is looked at in the overview nearest to the raster's cells. None where no cell has a value.
+    """
+    with gdal_settings(), rasterio.open(path) as file, rasterio.open(picture) as seen:
+        grid = {"crs": seen.crs, "transform": file.transform, "width": file.width, "height": file.height}
+        cells, covered = 0, 0
+        with WarpedVRT(seen, **grid, resampling=Nearest.nearest) as moved:
+            for _, window in file.block_windows(1):
+                valid = file.read_masks(1, window=window) > 0
+                if valid.any():
+                    cells += int(valid.sum())
+                    covered += int((moved.dataset_mask(window=window)[valid] > 0).sum())
+    return covered / cells if cells else None
 
 
 def count_codes(path: str | os.PathLike[str]) -> dict[int, int]:

@@ -4,6 +4,7 @@ PRODUCTS/catalog.json, PRODUCTS/<mission id>/collection.json and PRODUCTS/<missi
 from the versions that are there, file by file, each whole or not at all, and nothing is linked before it exists.
 """
 
+from collections.abc import Collection
 from datetime import datetime
 from pathlib import PurePosixPath
 from typing import Final, NamedTuple
@@ -12,6 +13,7 @@ import pystac
 
 from ..schemas.products import PRODUCTS
 from . import json_files, versions
+from .metadata import FILE_EXTENSION, multihash
 from .versions import Version
 
 CATALOG: Final = "catalog.json"
@@ -52,7 +54,7 @@ def update_mission(products: str, entry: MissionEntry, title: str) -> None:
     for name in json_files.names(f"{folder}/{_ITEMS}"):
         if name not in kept:
             json_files.remove(f"{folder}/{_ITEMS}/{name}")
-    update_catalog(products, title)
+    update_catalog(products, title, whole=False)
 
 
 def latest(products: str, mission_id: str) -> int:
@@ -62,13 +64,17 @@ def latest(products: str, mission_id: str) -> int:
     return max((int(name[1:]) for name in named), default=0)
 
 
-def update_catalog(products: str, title: str) -> None:
+def update_catalog(products: str, title: str, *, whole: bool = True) -> None:
     """Bring catalog.json up to date with the collections that are there.
 
     Two at once are both right in the end: each looks again after it has written.
+
+    Parameters
+    ----------
+    whole : also look whether what is linked is still there, which takes a request for each mission.
     """
-    written = None
-    while (there := _collections(products)) != written:
+    written = _linked(products, title)
+    while (there := _collections(products, () if whole else written or ())) != written:
         catalog = pystac.Catalog(
             id="seamosaic-archive", title=title or None, description=title or "Maps of the seabed by seamosaic"
         )
@@ -80,9 +86,20 @@ def update_catalog(products: str, title: str) -> None:
         written = there
 
 
-def _collections(products: str) -> list[str]:
+def _linked(products: str, title: str) -> list[str] | None:
+    """Missions that catalog.json links; None if it has another title."""
+    found = json_files.read_json(f"{products.rstrip('/')}/{CATALOG}") or {}
+    if found and found.get("title") != (title or None):
+        return None
+    links = found.get("links", [])
+    return [PurePosixPath(link["href"]).parent.name for link in links if link.get("rel") == pystac.RelType.CHILD]
+
+
+def _collections(products: str, known: Collection[str] = ()) -> list[str]:
+    """Missions that have a collection. known : those for which this need not be looked at."""
     root = products.rstrip("/")
-    return [name for name in json_files.names(root) if json_files.exists(f"{root}/{name}/{_COLLECTION}")]
+    missions = [name for name in json_files.names(root) if name != CATALOG]
+    return [name for name in missions if name in known or json_files.exists(f"{root}/{name}/{_COLLECTION}")]
 
 
 def _link(relation: str, target: str, media_type: str = pystac.MediaType.JSON) -> pystac.Link:
@@ -119,10 +136,13 @@ def _placeless(entry: MissionEntry, version: Version) -> pystac.Item:
         end_datetime=end,
         properties={name: value for name, value in properties.items() if value},
     )
-    there = json_files.names(str(version.path))
+    item.stac_extensions = [FILE_EXTENSION]
+    digests = (json_files.read_json(f"{version.path}/{versions.PROVENANCE}") or {}).get("outputs", {})
     for product in PRODUCTS:
-        if product.name in there:
+        if product.name in digests or product.name == versions.PROVENANCE:
             asset = pystac.Asset(product.name, product.name, product.description, product.media_type, [product.role])
+            if product.name in digests:
+                asset.extra_fields["file:checksum"] = multihash(digests[product.name])
             item.add_asset(product.name, asset)
     return item
 

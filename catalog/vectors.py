@@ -54,6 +54,7 @@ def write_survey(
     times: NDArray[np.datetime64],
     contours: Sequence[Contour],
     coverage: shapely.MultiPolygon,
+    area_m2: float,
 ) -> None:
     """Write a GeoPackage 1.2 with the layers footprints, track, contours and coverage; empty ones exist too.
 
@@ -62,11 +63,11 @@ def write_survey(
     crs_wkt : of the map; of a compound CRS the horizontal part.
     track : (N, 2) or (N, 3) camera centres in map coordinates, in order of time.
     times : (N,) UTC.
-    coverage : by the function of that name.
+    coverage : by the function of that name. area_m2 : of the map's cells themselves, which it generalises.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid4().hex[:8]}.gpkg")
-    layers = (_footprints(footprints), _track(track, times), _contours(contours), _coverage(coverage))
+    layers = (_footprints(footprints), _track(track, times), _contours(contours), _coverage(coverage, area_m2))
     try:
         for number, layer in enumerate(layers):
             pyogrio.raw.write(
@@ -123,9 +124,9 @@ def _contours(contours: Sequence[Contour]) -> _Layer:
     return _Layer("contours", "LineString", lines, {"elevation": elevations})
 
 
-def _coverage(coverage: shapely.MultiPolygon) -> _Layer:
+def _coverage(coverage: shapely.MultiPolygon, area_m2: float) -> _Layer:
     present = not coverage.is_empty
-    fields = {"area_m2": np.array([coverage.area] if present else [], float)}
+    fields = {"area_m2": np.array([area_m2] if present else [], float)}
     return _Layer("coverage", "MultiPolygon", [coverage] if present else [], fields)
 
 

@@ -13,10 +13,11 @@ def _inside(path: str) -> str:
     """A path that stays in the mission folder, so that the folder can be moved, zipped or put in a bucket."""
     if "\\" in path:
         raise inconsistent("", repr(path), "forward slashes", f"Write {path.replace(chr(92), '/')!r}.")
-    if path.startswith("/") or ":" in path.split("/")[0] or ".." in path.split("/"):
+    parts = [part for part in path.split("/") if part not in ("", ".")]
+    if path.startswith("/") or not parts or ":" in parts[0] or ".." in parts:
         remedy = "Copy the file into the mission folder and give its path from there."
         raise inconsistent("", repr(path), "a path inside the mission folder", remedy)
-    return path
+    return "/".join(parts)  # one file has one name
 
 
 RelativePath = Annotated[str, Field(min_length=1), AfterValidator(_inside)]
@@ -74,7 +75,7 @@ class NavigationSource(Model):
 
 
 class Reporting(Model):
-    """Who, where and under what licence: copied into the metadata of every product."""
+    """Who, where and under what licence: in quality.json, report and STAC item; who and licence in NetCDF, too."""
 
     organisation: str | None = None
     contact: str | None = None

@@ -6,6 +6,7 @@ from typing import Annotated, Final, NamedTuple
 from pydantic import Field
 
 from .base import Model
+from .mission import Reporting
 
 Count = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -110,10 +111,11 @@ class MissionSummary(Model):
     id: str
     title: str = ""
     platform: str = ""
-    start: Annotated[datetime | None, Field(description="first exposure, UTC")] = None
-    end: Annotated[datetime | None, Field(description="last exposure, UTC")] = None
+    start: Annotated[datetime | None, Field(description="first exposure that counts, UTC")] = None
+    end: Annotated[datetime | None, Field(description="last exposure that counts, UTC")] = None
     crs: Annotated[str | None, Field(description="name of the map's CRS; absent for a local frame")] = None
     vertical_reference: Annotated[str, Field(description="what elevations are measured from")] = ""
+    reporting: Annotated[Reporting | None, Field(description="as mission.yaml has it")] = None
     images: ImageCounts
 
 
@@ -121,8 +123,11 @@ class SoundingQuality(Model):
     """Laser points."""
 
     count: Count
-    per_image_median: Annotated[float | None, Field(ge=0)] = None
-    sigma_median_m: Metres | None = None
+    per_image_median: Annotated[float | None, Field(ge=0, description="over images with a laser")] = None
+    sigma_median_m: Annotated[
+        Metres | None,
+        Field(description="1-sigma of detection along the ray; what the calibration adds is in `calibration`"),
+    ] = None
     reasons: dict[str, Count] = Field(
         default_factory=dict, description="why images gave no soundings: reason to images"
     )
@@ -201,7 +206,9 @@ class TrajectoryQuality(Model):
     adjusted: Count
     navigation_only: Count
     rejected: Count
-    navigation_minus_adjusted: NavigationDifference | None = None
+    navigation_minus_adjusted: Annotated[NavigationDifference | None, Field(description="of the adjusted images")] = (
+        None
+    )
     sigma_median_m: Annotated[Vector | None, Field(description="1-sigma along x, y, z, metres")] = None
     reprojection_rms_px: Annotated[
         float | None, Field(ge=0, description="of tie points from where images see them, pixels at full resolution")

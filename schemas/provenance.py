@@ -25,7 +25,7 @@ class Step(Model):
     count_total: Annotated[int, Field(ge=0)]
     count_computed: Annotated[int, Field(ge=0)]
     count_reused: Annotated[int, Field(ge=0)]
-    core_seconds: Annotated[float, Field(ge=0)]
+    core_seconds: Annotated[float, Field(ge=0, description="processor time of what was computed")]
     started: datetime | None = None
     ended: datetime | None = None
 

@@ -110,11 +110,12 @@ class Coverage(NamedTuple):
     Attributes
     ----------
     seen : of what some camera saw.
-    seen_twice : of what two or more cameras saw; NaN if there is none.
+    seen_twice : of what two or more cameras saw.
+    Either is None if there is none.
     """
 
-    seen: float
-    seen_twice: float
+    seen: float | None
+    seen_twice: float | None
 
 
 def align(A: Array, B: Array, scale: bool = False) -> Similarity:
@@ -211,14 +212,14 @@ def spread(difference: Array) -> Spread:
     return Spread(float(np.sqrt((size**2).mean())), float(np.median(size)), float(np.percentile(size, 95)))
 
 
-def honesty(difference: Array, sigma: Array) -> tuple[float, float]:
+def honesty(difference: Array, sigma: Array) -> tuple[float | None, float | None]:
     """Shares of differences (N,) smaller than 1 and 2 of their stated sigma (N,); about 0.68 and 0.95 if honest.
 
-    NaN where no cell states a sigma.
+    None where no cell states a sigma.
     """
     stated = np.isfinite(sigma) & (sigma > 0)
     if not stated.any():
-        return float("nan"), float("nan")
+        return None, None
     ratio = abs(difference[stated]) / sigma[stated]
     return float((ratio < 1).mean()), float((ratio < 2).mean())
 
@@ -271,5 +272,5 @@ def coverage(
     return Coverage(_share(there, seen > 0), _share(there, seen > 1))
 
 
-def _share(there: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
-    return float((there & of).sum() / of.sum()) if of.any() else float("nan")
+def _share(there: NDArray[np.bool_], of: NDArray[np.bool_]) -> float | None:
+    return float((there & of).sum() / of.sum()) if of.any() else None

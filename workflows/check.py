@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+import pyproj
 import shapely
 from rich.console import Console
 from rich.markup import escape
@@ -20,6 +21,7 @@ from ..tasks.navigation import VehicleState, camera_poses
 from ..tasks.pairs import footprints
 from ..tasks.rings import rings
 from . import memory_need
+from .results import vertical_reference
 
 
 class Coverage(NamedTuple):
@@ -142,10 +144,7 @@ def _navigation(opened: OpenedMission) -> str:
 def _map(opened: OpenedMission) -> str:
     if opened.crs is None:
         return "local frame, origin at the first image placed"
-    crs = opened.crs.split('"')[1]
-    if opened.vertical is None:
-        return f"{crs}; heights below the sea surface at survey time"
-    return f"{crs}; {opened.vertical.split(chr(34))[1]}"
+    return f"{pyproj.CRS.from_wkt(opened.crs).name}; heights: {vertical_reference(opened)}"
 
 
 def _cells(seen: Coverage | None, parameters: Parameters) -> list[tuple[str, str]]:

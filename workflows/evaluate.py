@@ -222,7 +222,7 @@ def _positions(folder: Path) -> tuple[list[str], Array]:
 
 
 def _bathymetry(found: _Map, X: Array, truth: _Truth) -> dict[str, Any]:
-    figures: dict[str, Any] = {"cells": len(X), "cell_m": found.cell_m}
+    figures: dict[str, Any] = {"cells_compared": len(X), "cell_m": found.cell_m}
     if found.crs is not None:
         difference = X[:, 2] - truth.surface(X[:, 0], X[:, 1])
         figures |= {
@@ -324,7 +324,7 @@ def _cell_keys(found: _Map, x: Array, y: Array) -> NDArray[np.int64]:
 
 def _cloud_cells(found: _Map, path: Path) -> tuple[NDArray[np.int64], Array]:
     """Cell numbers and elevations of a cloud's points over the map, sorted by cell, then by elevation."""
-    keys, heights = [], []
+    keys, heights = [np.zeros(0, np.int64)], [np.zeros(0)]
     low, high = found.X[:, :2].min(axis=0) - found.cell_m, found.X[:, :2].max(axis=0) + found.cell_m
     with laspy.open(path) as file:
         crs = _horizontal(file.header.parse_crs()) or found.crs

@@ -16,7 +16,7 @@ from .maps_inputs import Image, MapJob, Pair, Tile, context, pose_digest, rows_o
 from .solve import Solution
 
 CELLS, GROWTH, SURFACE = "cells", "growth", "surface"
-_VERSION = code_version(sys.modules[__name__])
+_VERSION = code_version(sys.modules[__name__], dense)
 _LEAST_HALO = 6  # cells
 # Of the variance that poses give to matching: what a pair's poses do to all of its cells, and what neighbouring pairs
 # have in common, as they share images and the bend of the whole, so that it does not average down
@@ -177,7 +177,7 @@ def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]],
             "ground": found.elevation.astype(np.float32),
         }
         cut = {name: values[inner] for name, values in layers.items()}
-        return Made(cut, {"cells": int(np.isfinite(cut["elevation"]).sum())})
+        return Made(cut, {"cells": int(np.isfinite(cut["elevation"]).sum()), "max_sigma_m": worst})
 
     parameters = [list(tile), m.max_interpolation_m, worst, list(law)]
     return once(m.job, SURFACE, _VERSION, inputs, parameters, make, compress=True)

@@ -1,5 +1,6 @@
 """From stored results to a version's folder: every product of FORMATS, with quality figures and provenance."""
 
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -46,6 +47,7 @@ DECIDING = (
 )
 VERSION = code_version(*DECIDING)
 _WRITERS = 2  # each holds a tile
+_STAC_LICENCE = re.compile(r"[\w.+-]+")  # an SPDX identifier; other texts STAC has no field for
 
 
 def write(results: Results) -> tuple[Folder, bool, Quality]:
@@ -85,13 +87,13 @@ def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
     metadata.write_quality(folder / "quality.json", figures)
     provenance = _provenance(results, made_from)
     report.write_report(folder, figures, provenance, None if results.plan.prior is None else navigation)
-    if results.opened.crs is not None:
+    provenance = provenance.model_copy(update={"parts": parts, "outputs": metadata.output_digests(folder)})
+    metadata.write_provenance(folder / "metadata" / "provenance.json", provenance)
+    if results.opened.crs is not None:  # last: it lists all other files
         start, end = span(results.opened)
         mission = results.opened.mission
         number = versions.next_number(results.out, mission.id)
         metadata.write_stac_item(folder, mission.id, number, mission.title, start, end, _about(mission))
-    provenance = provenance.model_copy(update={"parts": parts, "outputs": metadata.output_digests(folder)})
-    metadata.write_provenance(folder / "metadata" / "provenance.json", provenance)
     return figures
 
 
@@ -122,7 +124,10 @@ def _parts(results: Results, crs_wkt: str) -> dict[str, str]:
 def _about(mission: Mission) -> dict[str, str]:
     """What mission.yaml says of platform, people, licence and place, for the metadata."""
     given = {} if mission.reporting is None else mission.reporting.model_dump(exclude_none=True)
-    named = {"platform": mission.platform, "license": given.pop("licence", "")}
+    licence = given.get("licence", "")
+    if _STAC_LICENCE.fullmatch(licence):
+        del given["licence"]
+    named = {"platform": mission.platform, "license": licence and ("other" if "licence" in given else licence)}
     return {name: value for name, value in {**named, **given}.items() if value}
 
 
@@ -300,6 +305,7 @@ def _write_survey(results: Results, folder: Path, crs_wkt: str, rows: Sequence[t
         np.array([row.time for row in placed], "datetime64[ns]"),
         [vectors.Contour(elevation, line) for elevation, line in lines],
         vectors.coverage(rasters.read_overview(folder / "bathymetry.tif")),
+        sum(done.info["cells"] for _, done in results.mapped.surface.tiles) * results.mapped.cell_m**2,
     )
 
 
@@ -307,7 +313,7 @@ def _provenance(results: Results, made_from: str) -> Provenance:
     job, mapped = results.job, results.mapped
     resolved = job.parameters.model_dump(mode="json")
     resolved["grid"] |= {"cell_m": mapped.cell_m, "max_interpolation_m": mapped.map_job.max_interpolation_m}
-    resolved["grid"]["max_sigma_m"] = mapped.map_job.max_sigma_m
+    resolved["grid"]["max_sigma_m"] = mapped.surface.tiles[0][1].info["max_sigma_m"]
     resolved["mosaic"]["cell_m"] = mapped.mosaic_cell_m
     return Provenance(
         digest=made_from,

@@ -58,6 +58,7 @@ def figures(
             end=end,
             crs=None if opened.crs is None else pyproj.CRS.from_wkt(opened.crs).name,
             vertical_reference=vertical_reference(opened),
+            reporting=opened.mission.reporting,
             images=ImageCounts(total=len(rows), by_role=dict(roles), by_status=dict(Counter(row.kind for row in rows))),
         ),
         soundings=_sounding_quality(results, soundings),
@@ -71,7 +72,7 @@ def figures(
         ),
         bathymetry=_bathymetry_quality(folder, results.mapped.cell_m),
         terrain=_terrain_quality(results, folder),
-        mosaic=_mosaic_quality(results),
+        mosaic=_mosaic_quality(results, folder),
         mesh=triangles,
         warnings=(
             *opened.warnings,
@@ -107,9 +108,11 @@ def _doubts(rows: Sequence[trajectories.Row], results: Results) -> Iterator[str]
 
 
 def _sounding_quality(results: Results, count: int) -> SoundingQuality | None:
-    if results.opened.calibration.laser is None:
+    roles = results.opened.frames["role"].values
+    if results.opened.calibration.laser is None or (roles == "texture").all():
         return None
-    lit = [done for done in results.posed.extracted.values() if "soundings" in done.info]
+    extracted = results.posed.extracted.items()
+    lit = [done for row, done in extracted if roles[row] != "texture" and not done.info["status"]]
     sigmas = [done.info["sigma_m"] for done in lit if done.info.get("sigma_m")]
     return SoundingQuality(
         count=count,
@@ -119,18 +122,21 @@ def _sounding_quality(results: Results, count: int) -> SoundingQuality | None:
     )
 
 
-def _pair_quality(results: Results) -> PairQuality:
+def _pair_quality(results: Results) -> PairQuality | None:
+    left, names = results.posed.solution.residuals, [str(name) for name in results.opened.frames["image"].values]
+    crossed = 0 if left is None else len(left.crossed)
+    if not results.posed.matched and not crossed:
+        return None
     used = {(int(i), int(j)) for i, j in results.posed.solution.pairs}
     linked = [done.info for i, j, done in results.posed.matched if (i, j) in used]
     models = Counter(info["model"] for info in linked)
-    left, names = results.posed.solution.residuals, [str(name) for name in results.opened.frames["image"].values]
     return PairQuality(
         tried=len(results.posed.matched),
         linked=len(linked),
         homography=models["homography"],
         essential=models["essential"],
         median_inliers=float(np.median([info["inliers"] for info in linked])) if linked else None,
-        crossed=0 if left is None else len(left.crossed),
+        crossed=crossed,
         crossover_rms_m=residual_quality.crossover_rms(results.posed.solution),
         residuals=tuple(residual_quality.pairs(names, results.posed.solution)),
     )
@@ -142,8 +148,9 @@ def _trajectory_quality(
     kinds = Counter(row.kind for row in rows)
     placed = [(k, row.pose) for k, row in enumerate(rows) if row.pose is not None]
     positions = np.array([pose.position for _, pose in placed]).reshape(-1, 3)
+    adjusted = np.array([rows[k].kind == "adjusted" for k, _ in placed], bool)
     difference = navigation[[k for k, _ in placed]] - positions if placed else np.zeros((0, 3))
-    difference = difference[np.isfinite(difference).all(1)]
+    difference = difference[adjusted & np.isfinite(difference).all(1)]
     sigmas = np.array([pose.sigma for _, pose in placed]).reshape(-1, 3)
     return TrajectoryQuality(
         adjusted=kinds["adjusted"],
@@ -207,15 +214,15 @@ def ring_text(scale: RingScale) -> str:
     return f"{scale.inner_cells} to {scale.outer_cells} cells, {scale.inner_m:g} to {scale.outer_m:g} m"
 
 
-def _mosaic_quality(results: Results) -> MosaicQuality:
+def _mosaic_quality(results: Results, folder: Path) -> MosaicQuality | None:
     cell = results.mapped.mosaic_cell_m
     pixels = sum(done.info["pixels"] for _, done in results.mapped.mosaic.tiles)
-    surface = sum(done.info["cells"] for _, done in results.mapped.surface.tiles) * results.mapped.cell_m**2
-    area = pixels * cell**2
+    if not pixels:
+        return None
     painted = sum(done.info["painted"] for _, done in results.mapped.mosaic.tiles)
     return MosaicQuality(
         cell_m=cell,
-        area_m2=area,
-        coverage_share=min(1.0, area / surface) if surface else None,
-        painted_share=painted / pixels if pixels else None,
+        area_m2=pixels * cell**2,
+        coverage_share=rasters.covered_share(folder / "bathymetry.tif", folder / "mosaic.tif"),
+        painted_share=painted / pixels,
     )

@@ -167,9 +167,9 @@ def _image_figures(quality: Quality) -> Iterator[KeyFigure]:
         shown = ", ".join(f"{size:,}" for size in trajectory.blocks[:6]) + (
             " ..." if len(trajectory.blocks) > 6 else ""
         )
-        meaning = (
-            f"of {shown} images: matches and crossing laser lines join each, navigation alone holds them to another"
-        )
+        meaning = f"of {shown} images: matches and crossing laser lines join each"
+        if len(trajectory.blocks) > 1:
+            meaning += ", navigation alone holds them to another"
         yield KeyFigure("Blocks of images", f"{len(trajectory.blocks):,}", meaning)
     if trajectory.navigation_minus_adjusted is not None:
         yield _difference_figure(trajectory.navigation_minus_adjusted)
@@ -191,18 +191,18 @@ def _sounding_figures(quality: Quality) -> Iterator[KeyFigure]:
         each = "" if soundings.per_image_median is None else f"; {soundings.per_image_median:,.0f} in a typical image"
         yield KeyFigure("Laser soundings", f"{soundings.count:,}", f"accepted points on the laser cross{each}")
         if soundings.sigma_median_m is not None:
-            meaning = "median 1-sigma along the ray from the camera"
+            meaning = "median 1-sigma of detection along the ray from the camera, the calibration's own not counted"
             yield KeyFigure("Precision of a sounding", f"± {_length(soundings.sigma_median_m)}", meaning)
-    if pairs is not None:
+    if pairs is not None and pairs.tried:
         inliers = "" if pairs.median_inliers is None else f"; {pairs.median_inliers:,.0f} tie points in a typical pair"
         yield KeyFigure(
             "Linked pairs of images",
             f"{pairs.linked:,} of {pairs.tried:,}",
             f"{pairs.homography:,} as flat ground, {pairs.essential:,} as relief{inliers}",
         )
-        if pairs.crossover_rms_m is not None:
-            meaning = f"rms distance of the laser lines of different images where they cross, {pairs.crossed:,} pairs"
-            yield KeyFigure("Crossovers", _length(pairs.crossover_rms_m), meaning)
+    if pairs is not None and pairs.crossover_rms_m is not None:
+        meaning = f"rms distance of the laser lines of different images where they cross, {pairs.crossed:,} pairs"
+        yield KeyFigure("Crossovers", _length(pairs.crossover_rms_m), meaning)
 
 
 def _calibration_figures(quality: Quality) -> Iterator[KeyFigure]:
@@ -298,7 +298,8 @@ def _pictures(
     yield _picture(
         "Precision of soundings",
         figures.sigma_histogram(soundings) if soundings.is_file() else None,
-        "1-sigma of every accepted laser point along its ray. A bar at 20 mm counts all beyond.",
+        "1-sigma of every accepted laser point along its ray, the calibration's included. A bar at 20 mm counts all "
+        "beyond.",
         wide=False,
     )
     yield _picture(

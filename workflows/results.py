@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pyproj
 
+from ..catalog import missions
 from ..catalog.missions import OpenedMission
 from ..schemas.provenance import Request, Step
 from ..tasks.grids import Grid
@@ -72,10 +73,11 @@ class Results(NamedTuple):
 
 
 def span(opened: OpenedMission) -> tuple[datetime, datetime]:
-    """First and last exposure; an image without a time has none."""
-    times = opened.frames["time"].values
-    times = times[~np.isnat(times)]
-    return _utc(times.min()), _utc(times.max())
+    """First and last exposure of the images that count."""
+    found = missions.span(opened.frames)
+    assert found is not None  # a mission is not opened without an image that has a time
+    start, end = map(_utc, found)
+    return start, end
 
 
 def _utc(time: np.datetime64) -> datetime:
@@ -88,4 +90,6 @@ def vertical_reference(opened: OpenedMission) -> str:
         return "the centre of projection of the first image placed"
     if opened.vertical is not None:
         return pyproj.CRS.from_wkt(opened.vertical).name
+    if opened.mission.tide is not None:
+        return f"the zero of the tide table {opened.mission.tide}, of which mission.yaml names no datum"
     return "the sea surface at survey time"

@@ -35,7 +35,7 @@ class Ledger:
                 count_total=len(made["done"]),
                 count_computed=sum(done.computed for done in made["done"]),
                 count_reused=sum(not done.computed for done in made["done"]),
-                core_seconds=round(sum(done.seconds for done in made["done"]), 3),
+                core_seconds=round(sum(done.seconds for done in made["done"] if done.computed), 3),
                 started=made["started"],
                 ended=made["ended"],
             )

@@ -1,9 +1,13 @@
 """archive.yaml: what it names, and everything that can be wrong with it."""
 
+import errno
 import shutil
 
 import pytest
+from fsspec.implementations.local import LocalFileSystem
+from fsspec.implementations.memory import MemoryFileSystem
 from seamosaic.catalog import archives
+from seamosaic.catalog.filesystems import ObjectStoreError
 from seamosaic.schemas.problems import InvalidInput
 
 
@@ -94,3 +98,56 @@ def test_no_archive_and_no_missions(archive, tmp_path):
     shutil.rmtree(archive / "missions")
     with pytest.raises(InvalidInput, match=r"folders with a mission\.yaml that match missions"):
         archives.open_archive(str(archive))
+
+
+def test_an_archive_is_the_same_by_any_way_that_leads_to_it(archive, tmp_path):
+    elsewhere, link = tmp_path / "disk/c", tmp_path / "link"
+    shutil.copytree(archive / "missions/a", elsewhere)
+    (archive / "missions/c").symlink_to(elsewhere)
+    (archive / "missions/d").symlink_to(archive / "missions/a")
+    link.symlink_to(archive)
+    missions = tuple(sorted(map(str, (archive / "missions/a", archive / "missions/b", elsewhere))))
+    for url in (archive, link, archive / "missions/..", f"file://{link}", f"{link}/"):
+        assert archives.is_archive(str(url))
+        opened = archives.open_archive(str(url))
+        assert (opened.url, opened.products, opened.missions) == (str(archive), f"{archive}/products", missions)
+
+
+@pytest.mark.parametrize(
+    "pattern", ["missions/*", "missions/[ab]", "*/?", "**", "missions/**", "./missions//*/", "{}/*"]
+)
+def test_patterns(archive, pattern):
+    (archive / "archive.yaml").write_text(f"format: 1\nmissions: ['{pattern.format('missions')}']\n")
+    assert [mission[-1] for mission in archives.open_archive(str(archive)).missions] == ["a", "b"]
+
+
+def test_missions_that_cannot_be_listed_are_not_left_out(archive, monkeypatch):
+    def failing(fs, path, **_):
+        raise OSError(errno.EIO, "Input/output error", path)
+
+    monkeypatch.setattr(LocalFileSystem, "ls", failing)
+    with pytest.raises(OSError, match="Input/output"):
+        archives.open_archive(str(archive))
+
+
+def test_a_mission_that_may_not_be_read_is_one_nevertheless(archive, monkeypatch):
+    info = LocalFileSystem.info
+
+    def closed(fs, path, **more):
+        if "missions/a/" in str(path):
+            raise PermissionError(13, "Permission denied")
+        return info(fs, path, **more)
+
+    monkeypatch.setattr(LocalFileSystem, "info", closed)
+    assert [mission[-1] for mission in archives.open_archive(str(archive)).missions] == ["a", "b"]
+
+
+def test_a_store_that_does_not_answer_is_no_mistake_of_the_user(monkeypatch):
+    def failing(*_, **__):
+        raise OSError("503: slow down")
+
+    for name in ("info", "cat_file"):
+        monkeypatch.setattr(MemoryFileSystem, name, failing)
+    for ask in (archives.is_archive, archives.open_archive):
+        with pytest.raises(ObjectStoreError, match=r"503: slow down\. Check .* AWS_ENDPOINT_URL"):
+            ask("memory://bucket/archive")

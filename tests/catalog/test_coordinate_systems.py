@@ -89,6 +89,17 @@ def test_a_crs_of_another_place() -> None:
     assert resolved("EPSG:3832", position=(0.0, 179.9)).warnings == []  # its area straddles the 180th meridian
 
 
+@pytest.mark.parametrize(("code", "warned"), [("EPSG:3857", True), ("EPSG:32631", False), ("EPSG:2154", False)])
+def test_a_crs_in_which_a_metre_is_none_is_warned_of(code, warned) -> None:
+    warnings = resolved(code, position=(43.04, 3.01)).warnings
+    assert any("a metre on the seabed is 1.36" in warning for warning in warnings) == warned
+
+
+def test_a_crs_that_counts_west_is_refused() -> None:
+    (problem,) = resolved("EPSG:2048", position=(-34.0, 19.0)).problems
+    assert "x to the east" in problem.expected
+
+
 def test_a_crs_that_does_not_reach_the_place() -> None:
     gnomonic = "+proj=gnom +lat_0=90 +lon_0=0 +datum=WGS84"  # a hemisphere is all it can show
     (problem,) = resolved(gnomonic, position=(-45.0, 6.0)).problems

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import fsspec
 import pytest
+import s3fs
 from seamosaic.catalog import digests
 from seamosaic.catalog.digests import inspect_images, peek_images
 
@@ -59,3 +60,18 @@ def test_a_file_that_cannot_be_read(files: list[Path]) -> None:
         assert found[0].header.fault == ""
         assert "cannot be read" in found[1].header.fault
     assert len(known) == 1
+
+
+def test_a_peek_fetches_little_of_an_object(s3, monkeypatch: pytest.MonkeyPatch) -> None:
+    fs = s3fs.S3FileSystem(use_listings_cache=False)
+    path = f"{s3.bucket}/large.jpg"
+    fs.pipe_file(path, b"\xff\xd8" + bytes(4_000_000))
+    fetched, fetch = [], s3fs.S3File._fetch_range
+
+    def counting(file, start, end):
+        fetched.append(end - start)
+        return fetch(file, start, end)
+
+    monkeypatch.setattr(s3fs.S3File, "_fetch_range", counting)
+    peek_images(fs, [(path, fs.info(path))])
+    assert 0 < sum(fetched) < 600_000

@@ -57,3 +57,11 @@ def test_a_file_system_without_hard_links(tmp_path, monkeypatch):
         json_files.write_json(str(tmp_path / "a.json"), 2, new=True)
     assert json_files.read_json(str(tmp_path / "a.json")) == 1
     assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    settled = []
+    monkeypatch.setattr(json_files, "settle", lambda path: settled.append((path, (tmp_path / "a.json").exists())))
+    json_files.write_json(str(tmp_path / "a.json"), 1)
+    assert [finished for _, finished in settled] == [False, True]
+    assert settled[1][0] == str(tmp_path)

@@ -117,7 +117,18 @@ def test_who_was_silent_for_too_long_has_lost_it(tmp_path):
     with leases.take(str(tmp_path), "reef", term_s=0.5) as lease:
         json_files.write_json(lease.url, lease.holder._replace(token="another")._asdict())
         assert lease.lost.wait(5)
+        assert "another run took over" in lease.why
     assert json_files.exists(lease.url)  # it is another's now
+
+
+def test_who_could_not_renew_it_has_lost_it_and_says_so(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError("no space left on device")
+
+    with leases.take(str(tmp_path), "reef", term_s=0.5) as lease:
+        monkeypatch.setattr(json_files, "write_json", full)
+        assert lease.lost.wait(5)
+        assert "could not be renewed for 0.5 s" in lease.why
 
 
 def test_runs_of_one_mission_share_and_are_not_pruned(tmp_path):
@@ -132,11 +143,15 @@ def test_runs_of_one_mission_share_and_are_not_pruned(tmp_path):
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_pruning_is_waited_for(tmp_path, shared):
+def test_pruning_is_waited_for(tmp_path, shared, caplog):
     pruning = leases.take(str(tmp_path), "reef", "prune")
     threading.Timer(0.5, json_files.remove, [pruning.url]).start()
-    lease = leases.take(str(tmp_path), "reef", shared=shared)
+    with caplog.at_level("INFO", "seamosaic"):
+        lease = leases.take(str(tmp_path), "reef", shared=shared)
     assert lease.holder.since >= pruning.holder.since + 0.4
+    assert [record.getMessage().split(" by ")[0] for record in caplog.records] == [
+        "mission=reef step=lease waiting for prune"
+    ]
 
 
 def test_what_a_signal_interrupts_before_it_is_entered_is_given_back(out):

@@ -3,6 +3,7 @@
 import os
 
 import pytest
+from fsspec.implementations.local import LocalFileSystem
 from seamosaic.catalog import digests, memory
 from seamosaic.schemas.problems import InvalidInput
 
@@ -147,3 +148,31 @@ def test_what_another_run_read_meanwhile_is_kept(tiny_mission, tmp_path, read, m
     memory.look(url, out)
     assert memory.look(url, out).unread == 0
     assert len(read) == 10
+
+
+def test_a_mission_is_known_by_any_way_that_leads_to_it(tiny_mission, tmp_path, read):
+    out, link = str(tmp_path / "out"), tmp_path / "link"
+    link.symlink_to(tiny_mission)
+    memory.open_known(str(tiny_mission), out)
+    for url in (link, f"file://{link}", tiny_mission / "images/..", f"{link}/"):
+        assert memory.look(str(url), out).unread == 0
+        memory.open_known(str(url), out)
+    assert len(read) == 10
+
+
+def test_a_folder_that_may_not_be_looked_into_is_passed_over_but_not_trusted(tiny_mission, tmp_path, read, monkeypatch):
+    url, out, opened = str(tiny_mission), str(tmp_path / "out"), memory.open_mission
+    (tiny_mission / "lost+found").mkdir()
+    list_it = LocalFileSystem.ls
+
+    def closed(fs, path, **more):
+        if path.endswith("lost+found"):
+            raise PermissionError(13, "Permission denied")
+        return list_it(fs, path, **more)
+
+    monkeypatch.setattr(LocalFileSystem, "ls", closed)
+    memory.open_known(url, out)
+    times = []
+    monkeypatch.setattr(memory, "open_mission", lambda *given, **more: times.append(1) or opened(*given, **more))
+    assert [memory.look(url, out).unread for _ in range(2)] == [0, 0]
+    assert (len(times), len(read)) == (2, 10)

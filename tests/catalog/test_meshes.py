@@ -119,13 +119,6 @@ def test_ply_keeps_axes_colours_and_comments(tmp_path):
     assert "comment offset 5e5 4.7e6 0" in header
 
 
-def test_ply_texture_coordinates_have_t_up(tmp_path):
-    vertices, triangles = surface(5)
-    meshes.write_ply(tmp_path / "m.ply", vertices, triangles, uv=texture_coordinates(vertices))
-    mesh = trimesh.load(tmp_path / "m.ply", process=False)
-    np.testing.assert_allclose(mesh.visual.uv, vertices[:, :2] / [EAST, NORTH], atol=1e-6)
-
-
 def test_an_empty_surface_is_a_readable_file(tmp_path):
     nothing, none = np.zeros((0, 3)), np.zeros((0, 3), int)
     meshes.write_glb(tmp_path / "m.glb", [meshes.Part(nothing, nothing, none, nothing[:, :2])])

@@ -1,3 +1,4 @@
+import errno
 import hashlib
 import os
 import shutil
@@ -10,8 +11,13 @@ import numpy as np
 import pyproj
 import pytest
 import xarray
+from fsspec.implementations.local import LocalFileSystem
+from fsspec.implementations.memory import MemoryFileSystem
 from PIL import Image
-from seamosaic.catalog.missions import open_mission
+from seamosaic.catalog import digests
+from seamosaic.catalog.filesystems import ObjectStoreError
+from seamosaic.catalog.missions import open_mission, span
+from seamosaic.workflows.results import vertical_reference
 
 from tests.catalog.edited import copy, edit, images, problem, problems, status, truncate, without_navigation
 
@@ -112,6 +118,74 @@ def test_a_quick_look_reads_no_digests(tiny_mission: Path) -> None:
     xarray.testing.assert_identical(quick.frames.drop_vars("sha256"), full.frames.drop_vars("sha256"))
 
 
+def test_a_quick_look_reads_only_what_is_not_known(tiny_mission: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    known: dict = {}
+    open_mission(str(tiny_mission), known)
+    copy(images(tiny_mission)[3])
+    peeked, peek = [], digests._peek
+    monkeypatch.setattr(digests, "_peek", lambda fs, path: peeked.append(Path(path).stem) or peek(fs, path))
+    frames = open_mission(str(tiny_mission), known, hashed=None).frames
+    assert [name[-5:] for name in peeked] == ["_copy"]
+    assert set(frames["sha256"].values) == {""}
+
+
+def test_one_file_has_one_name_however_it_is_written(tiny_mission: Path) -> None:
+    before = open_mission(str(tiny_mission))
+    edit(
+        tiny_mission / "mission.yaml",
+        ("images/*.jpg", "./images//*.jpg"),
+        ("calibration: calibration.yaml", "calibration: .//calibration.yaml"),
+    )
+    after = open_mission(str(tiny_mission))
+    xarray.testing.assert_identical(after.frames, before.frames)
+    assert set(after.input_digests) == set(before.input_digests)
+    edit(tiny_mission / "mission.yaml", (".//calibration.yaml", "./"))
+    assert problem(tiny_mission).key == "calibration"
+
+
+def test_a_folder_that_cannot_be_listed_is_no_empty_folder(tiny_mission: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tiny_mission / "images/deep").mkdir()
+    images(tiny_mission)[1].rename(tiny_mission / "images/deep" / images(tiny_mission)[1].name)
+    list_it = LocalFileSystem.ls
+
+    def failing(fs, path, **more):
+        if path.endswith("deep"):
+            raise OSError(errno.EIO, "Input/output error", path)
+        return list_it(fs, path, **more)
+
+    monkeypatch.setattr(LocalFileSystem, "ls", failing)
+    for pattern in ("**/*", "*/*"):
+        text = (tiny_mission / "mission.yaml").read_text()
+        (tiny_mission / "mission.yaml").write_text(text.replace("images/*.jpg", f"images/{pattern}.jpg"))
+        with pytest.raises(OSError, match="Input/output"):
+            open_mission(str(tiny_mission))
+        (tiny_mission / "mission.yaml").write_text(text)
+    assert open_mission(str(tiny_mission)).frames.sizes["image"] == 9  # it is not looked for there
+
+
+def test_a_store_that_does_not_answer_is_no_mistake_of_the_user(
+    tiny_mission: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = fsspec.filesystem("memory")
+    memory.put(f"{tiny_mission}/", "/unwell/", recursive=True)
+    read = MemoryFileSystem.cat_file
+
+    def failing(fs, path, *given, **more):
+        if path.endswith("navigation.csv"):
+            raise OSError("503: slow down")
+        return read(fs, path, *given, **more)
+
+    monkeypatch.setattr(MemoryFileSystem, "cat_file", failing)
+    with pytest.raises(ObjectStoreError, match=r"navigation.csv: 503: slow down\. Check .* AWS_ENDPOINT_URL"):
+        open_mission("memory://unwell")
+    for name in ("info", "ls"):
+        monkeypatch.setattr(MemoryFileSystem, name, lambda *_, **__: (_ for _ in ()).throw(OSError("500")))
+    with pytest.raises(ObjectStoreError, match="500"):
+        open_mission("memory://unwell")
+    monkeypatch.undo()
+    memory.rm("/unwell", recursive=True)
+
+
 def test_without_navigation(tiny_mission: Path) -> None:
     without_navigation(tiny_mission)
     opened = open_mission(str(tiny_mission))
@@ -136,10 +210,29 @@ def test_tide_and_time_offset(tiny_mission: Path) -> None:
     assert (problem(tiny_mission).file, problem(tiny_mission).key) == ("tide.csv", "time")
 
 
+def test_the_mission_lasts_from_the_first_to_the_last_image_that_counts(tiny_mission: Path) -> None:
+    frames = open_mission(str(tiny_mission)).frames
+    old = frames["time"].values.copy()
+    old[0] = np.datetime64("1980-01-01")
+    status = np.where(np.arange(10) == 0, "rejected: outside the navigation", "")
+    wrong = frames.assign(time=("image", old), status=("image", status))
+    assert span(frames) == (frames["time"].values[0], frames["time"].values[-1])
+    assert span(wrong) == (frames["time"].values[1], frames["time"].values[-1])
+    assert span(wrong.assign(status=("image", ["rejected: all"] * 10)))[0] == old[0]
+
+
+def test_a_datum_in_a_compound_crs_is_one(tiny_mission: Path) -> None:
+    edit(tiny_mission / "mission.yaml", ("calibration:", "crs: EPSG:32632+5714\ncalibration:"))
+    (warning,) = open_mission(str(tiny_mission)).warnings
+    assert "no tide" in warning
+
+
 def test_a_tide_without_a_datum_is_worth_a_word(tiny_mission: Path) -> None:
     edit(tiny_mission / "mission.yaml", ("calibration:", "tide: tide.csv\ncalibration:"))
     (tiny_mission / "tide.csv").write_text("time,height\n2026-06-03T02:14:00Z,1.0\n2026-06-03T02:15:00Z,1.0\n")
-    assert "vertical_datum" in open_mission(str(tiny_mission)).warnings[0]
+    opened = open_mission(str(tiny_mission))
+    assert "vertical_datum" in opened.warnings[0]
+    assert vertical_reference(opened).startswith("the zero of the tide table tide.csv")
 
 
 def test_a_datum_without_a_tide_is_worth_a_word(tiny_mission: Path) -> None:

@@ -47,16 +47,6 @@ def test_crs_is_in_the_file(tmp_path, wkt):
     assert found.equals(pyproj.CRS.from_wkt(wkt), ignore_axis_order=True)
 
 
-def test_colours_are_sixteen_bits_wide(tmp_path):
-    with pointclouds.SoundingsWriter(tmp_path / "s.laz", UTM.to_wkt(), OFFSET, coloured=True) as writer:
-        writer.write(*soundings(2), np.array([[255, 0, 10], [0, 128, 255]], np.uint8))
-        with pytest.raises(ValueError, match="with colours"):
-            writer.write(*soundings(2))
-    found = laspy.read(tmp_path / "s.laz")
-    np.testing.assert_array_equal(found.red, [65535, 0])
-    np.testing.assert_array_equal(found.blue // 257, [10, 255])
-
-
 def test_no_soundings_make_an_empty_file(tmp_path):
     with pointclouds.SoundingsWriter(tmp_path / "s.laz", UTM.to_wkt(), OFFSET):
         pass

@@ -3,8 +3,11 @@
 import os
 import time
 
+import fsspec
 import numpy as np
 import pytest
+from fsspec.implementations.local import LocalFileSystem
+from fsspec.implementations.memory import MemoryFileSystem
 from seamosaic.catalog import leases, pruning
 from seamosaic.catalog.store import Store
 
@@ -77,3 +80,58 @@ def test_what_killed_runs_left_half_written_goes_whatever_the_limit(out):
     pruned = pruning.prune(str(out), 1e9)
     assert (pruned.entries, half.exists()) == (1, False)
     assert left(out) == list(range(6))
+
+
+def test_what_cannot_be_deleted_is_said_and_holds_nothing_else_up(out, monkeypatch):
+    remove = LocalFileSystem.rm_file
+
+    def closed(fs, path):
+        if KEYS[5] in path:
+            raise PermissionError(13, "Permission denied", path)
+        remove(fs, path)
+
+    monkeypatch.setattr(LocalFileSystem, "rm_file", closed)
+    one = size_of_one(out)
+    pruned = pruning.prune(str(out), 0)
+    assert (pruned.freed, pruned.entries, left(out)) == (5 * one, 5, [5])
+    (why,) = pruned.failed
+    assert why.startswith("reef: [Errno 13] Permission denied")
+
+
+@pytest.fixture
+def remote(out):
+    memory = fsspec.filesystem("memory")
+    memory.put(f"{out}/", f"/{out.name}/", recursive=True)
+    yield f"memory://{out.name}"
+    memory.rm(f"/{out.name}", recursive=True)
+
+
+def test_a_store_removes_many_at_once(remote, monkeypatch):
+    asked, remove = [], MemoryFileSystem.rm
+    monkeypatch.setattr(MemoryFileSystem, "rm", lambda fs, paths: asked.append(len(paths)) or remove(fs, paths))
+    assert pruning.prune(remote, 0).entries == 6
+    assert asked == [3, 3]
+
+
+def test_what_a_store_keeps_in_silence_is_not_freed(remote, monkeypatch):
+    monkeypatch.setattr(MemoryFileSystem, "rm", lambda *_: None)
+    pruned = pruning.prune(remote, 0)
+    assert (pruned.freed, sorted(pruned.failed)) == (
+        0,
+        [f"{name}: 3 results cannot be deleted" for name in ("reef", "sea")],
+    )
+
+
+def test_without_its_lease_it_removes_nothing_more(out, monkeypatch):
+    take = leases.take
+
+    def lost(*given):
+        lease = take(*given)
+        lease.why = "another run took over"
+        lease.lost.set()
+        return lease
+
+    monkeypatch.setattr(leases, "take", lost)
+    pruned = pruning.prune(str(out), 0)
+    assert (pruned.entries, left(out)) == (0, list(range(6)))
+    assert sorted(pruned.failed) == ["reef: another run took over", "sea: another run took over"]

@@ -10,7 +10,7 @@ import pyproj
 import pystac
 import pystac.validation
 import pytest
-from seamosaic.catalog import metadata, rasters, stac, versions
+from seamosaic.catalog import json_files, metadata, rasters, stac, versions
 
 ENTRY = stac.MissionEntry("reef", "A reef", "Vortex", "2026-06-03T10:00:00Z", "2026-06-03T11:30:00Z")
 START, END = (datetime.fromisoformat(text.replace("Z", "+00:00")) for text in (ENTRY.start, ENTRY.end))
@@ -63,10 +63,15 @@ def test_the_catalogue_is_valid_and_leads_to_every_file(tmp_path):
 
 
 def test_a_mission_without_a_place_is_in_it_too(tmp_path):
-    make_version(tmp_path, "pool", 1, crs=None)
+    folder, sha = make_version(tmp_path, "pool", 1, crs=None), "ab" * 32
+    outputs = {"outputs": {"trajectory.csv": sha, "terrain/slope.tif": sha, "mesh-3dtiles/0/1_1.glb": sha}}
+    provenance = json.loads((folder / versions.PROVENANCE).read_text())
+    (folder / versions.PROVENANCE).write_text(json.dumps(provenance | outputs))
     stac.update_mission(str(tmp_path), ENTRY._replace(id="pool", title=""), "")
     _, (item,) = validate(tmp_path)
-    assert (item.geometry, item.bbox, set(item.assets)) == (None, None, {"trajectory.csv"})
+    assert (item.geometry, item.bbox) == (None, None)
+    assert set(item.assets) == {"trajectory.csv", "terrain/slope.tif", versions.PROVENANCE}
+    assert item.assets["terrain/slope.tif"].extra_fields["file:checksum"] == f"1220{sha}"
     assert item.common_metadata.start_datetime == START
 
 
@@ -104,3 +109,23 @@ def test_the_items_of_the_versions_stay_as_they_are(tmp_path, number):
     stac.update_mission(str(tmp_path), ENTRY, "")
     assert item.read_bytes() == before
     assert datetime.fromisoformat(json.loads(before)["properties"]["created"]) < datetime.now(UTC)
+
+
+def test_a_catalogue_of_many_is_not_gone_through_for_each(tmp_path, monkeypatch):
+    names = [f"reef-{k}" for k in range(5)]
+    for name in names:
+        make_version(tmp_path, name, 1, crs=None)
+    asked, exists = [], json_files.exists
+    monkeypatch.setattr(json_files, "exists", lambda url: asked.append(url) or exists(url))
+    for name in names:
+        stac.update_mission(str(tmp_path), ENTRY._replace(id=name), "All")
+    asked.clear()
+    stac.update_mission(str(tmp_path), ENTRY._replace(id=names[0]), "All")
+    assert asked == []
+    shutil.rmtree(tmp_path / names[1])
+    (tmp_path / names[2] / "collection.json").unlink()
+    stac.update_catalog(str(tmp_path), "All")
+    catalog, _ = validate(tmp_path)
+    assert [child.id for child in catalog.get_children()] == [names[0], *names[3:]]
+    stac.update_catalog(str(tmp_path), "Others")
+    assert validate(tmp_path)[0].title == "Others"

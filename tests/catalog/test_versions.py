@@ -9,7 +9,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from seamosaic.catalog import versions
+from seamosaic.catalog import runs, versions
 from seamosaic.catalog.versions import VersionWriter
 
 HOST = socket.gethostname()
@@ -134,3 +134,27 @@ def test_leftovers_of_dead_runs_are_removed_and_those_of_live_ones_kept(tmp_path
     versions.new_version(tmp_path, "reef", "two")
     assert [path.exists() for path in (gone, abandoned, alive, elsewhere, foreign)] == [False, False, True, True, True]
     assert (tmp_path / "reef" / "v1").exists()
+
+
+def test_a_version_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    settled = []
+
+    def settle(path):
+        settled.append((path.name, (tmp_path / "reef/v1").exists()))
+
+    monkeypatch.setattr(versions, "settle", settle)
+    write(tmp_path, "one")
+    before = {name for name, finished in settled if not finished}
+    assert before >= {"provenance.json", "report.html", "metadata"}
+    assert settled[-1] == ("reef", True)
+
+
+def test_a_process_number_of_another_container_or_start_says_nothing(tmp_path):
+    """Its host may have our name."""
+    ours, name = runs._realm(), runs.run_name()
+    assert name.startswith(f"{HOST}-{os.getpid()}.{ours}-" if ours else f"{HOST}-{os.getpid()}-")
+    here = leftover(tmp_path, f".new-{name}".replace(str(os.getpid()), str(dead_pid()), 1))
+    elsewhere = leftover(tmp_path, f".new-{HOST}-{dead_pid()}.01234567-0123abcd")
+    old = leftover(tmp_path, f".new-{HOST}-{dead_pid()}.01234567-89abcdef", age_s=versions.LEASE_S + 60)
+    versions.new_version(tmp_path, "reef", "two")
+    assert [path.exists() for path in (here, elsewhere, old)] == [False, True, False]

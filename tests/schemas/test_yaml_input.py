@@ -287,4 +287,17 @@ def test_sheets_are_two_and_lean() -> None:
     twice = with_line(CALIBRATION, f"{LASER}[{PLANE}, {{name: a, normal: [-0.6, 0.8, 0], offset: 1}}]")
     assert "named a" in problems(twice, Calibration)["laser.planes"].found
     plus = with_line(CALIBRATION, LASER + "{baseline: 1.2, angle: 25, roll: 90}")
-    assert "90 degrees" in problems(plus, Calibration)["laser.planes.roll"].found
+    roll = problems(plus, Calibration)["laser.planes.roll"]
+    assert "90 degrees" in roll.found
+    upright = with_line(CALIBRATION, f"{LASER}[{PLANE}, {{name: b, normal: [1, 0, 0], offset: 1}}]")
+    sheet = problems(upright, Calibration)["laser.planes.1.normal"]
+    assert "a plus" in sheet.found
+    assert sheet.expected == roll.expected
+
+
+@pytest.mark.parametrize("wavelength_nm", [450, 638])
+def test_the_laser_is_green(wavelength_nm: float) -> None:
+    light = LASER.replace("laser:\n", f"laser:\n  wavelength_nm: {wavelength_nm}\n")
+    (problem,) = problems(with_line(CALIBRATION, light + "{baseline: 1.2, angle: 25}"), Calibration).values()
+    assert problem.key == "laser.wavelength_nm"
+    assert problem.expected == "a number >= 500 and <= 560 (nm; the detector looks for green light)"

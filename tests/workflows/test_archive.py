@@ -1,6 +1,7 @@
 """An archive as it is used: scheduled runs, two at once, reprocessing, comparing and pruning; and what goes wrong."""
 
 import json
+import multiprocessing
 import os
 import re
 import shutil
@@ -10,6 +11,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 
 import fsspec
@@ -18,8 +20,9 @@ import pytest
 import yaml
 from seamosaic.catalog import json_files, leases, memory, records, stac, versions
 from seamosaic.catalog.archives import open_archive
+from seamosaic.catalog.pruning import Pruned
 from seamosaic.schemas.problems import InvalidInput
-from seamosaic.workflows import cli, run
+from seamosaic.workflows import archive_run, cli, run
 from seamosaic.workflows.archive_reprocess import change_parameters
 from seamosaic.workflows.archive_run import Options, run_archive
 from seamosaic.workflows.archive_states import assess_all
@@ -333,6 +336,59 @@ def test_a_run_frees_what_is_over_the_limit(archive):
     assert summary.pruned is not None
     assert summary.pruned.freed == summary.pruned.before > 100_000
     assert not list(archive.glob("products/*/steps/**/*.npz"))
+
+
+def test_a_run_that_cannot_free_anything_has_its_summary(archive, monkeypatch, caplog):
+    def failing(*_, **__):
+        raise OSError("503: slow down")
+
+    monkeypatch.setattr(archive_run.pruning, "prune", failing)
+    write(archive, keep_gb=0)
+    shutil.rmtree(archive / "products/plane-1")
+    change = archive / "missions/m01/mission.yaml"
+    change.unlink()
+    summary = run_archive(open_archive(str(archive)), SYNC)
+    assert (summary.failed, summary.pruned) == (False, None)
+    assert "not freed: 503: slow down" in caplog.text
+    catalog, _ = validate(archive / "products")
+    assert [child.id for child in catalog.get_children()] == ["plane-0"]  # plane-1 is gone
+
+
+def test_the_command_says_what_it_could_not_free(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        archive_run.pruning, "prune", lambda *_, **__: Pruned(2, 1, 1, (), ("reef: Permission denied",))
+    )
+    result = invoke("prune", tmp_path, "--keep-gb", "0")
+    assert (result.exit_code, "not freed: reef: Permission denied" in result.output) == (1, True)
+
+
+class Stuck:
+    """A process that ends only when it is killed."""
+
+    exitcode, killed = None, False
+
+    def join(self, timeout=None):
+        if not self.killed:
+            assert timeout is not None
+
+    def kill(self):
+        self.killed = True
+
+
+@pytest.mark.parametrize(("answer", "outcome"), [(("done", 1, False, 0, 9), "current"), (None, "failed")])
+def test_a_child_without_its_lease_is_waited_for_in_vain_no_longer_but_heard(archive, answer, outcome):
+    child, opened = archive_run._Child.__new__(archive_run._Child), open_archive(str(archive))
+    child._answers, sender = multiprocessing.Pipe(duplex=False)
+    child.state, child._archive, child.process, child._started = state_of(archive), opened, Stuck(), 0.0
+    child.lease, child.held = leases.take(opened.products, "plane-0"), ExitStack()
+    child.lease.why = "its lease could not be renewed"
+    child.lease.lost.set()
+    if answer:
+        sender.send(answer)
+    sender.close()
+    found = child.outcome()
+    assert (found.outcome, child.process.killed) == (outcome, True)
+    assert found.why == ("nothing changed" if answer else "its lease could not be renewed")
 
 
 def test_a_mission_that_is_not_selected_is_left_alone(archive):

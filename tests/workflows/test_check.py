@@ -32,7 +32,7 @@ def test_a_valid_mission(tiny_mission: Path) -> None:
     assert plan["images"] == "10 combined"
     assert plan["time"] == "2026-06-03 02:14:10 to 2026-06-03 02:14:19 UTC (0 min 9 s)"
     assert plan["navigation"] == "navigation.csv, horizontal 1-sigma 0.4 m"
-    assert plan["map"] == "WGS 84 / UTM zone 32N; heights below the sea surface at survey time"
+    assert plan["map"] == "WGS 84 / UTM zone 32N; heights: the sea surface at survey time"
     # 3.1 m at 80 px of focal length: 38.75 mm a pixel, four of them a cell.
     assert plan["height"] == "camera 3.10 m above the seabed, 39 mm a pixel"
     assert plan["bathymetry cell"].startswith("0.155 m, about ")
@@ -100,7 +100,7 @@ def test_rejections_and_datum_are_told(tiny_mission: Path) -> None:
     result = check(str(tiny_mission), DEFAULT)
     plan = dict(result.plan)
     assert plan["images"] == "9 combined (1 rejected)"
-    assert plan["map"].endswith("; MSL height")
+    assert plan["map"].endswith("; heights: MSL height")
     assert "truncated" in printed(result)
 
 

@@ -7,6 +7,7 @@ import time
 
 import pytest
 from dask.delayed import delayed
+from distributed.system import MEMORY_LIMIT
 from seamosaic.schemas.cluster import Cluster
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.yaml_input import load_model
@@ -60,6 +61,19 @@ def test_a_local_cluster_has_its_workers(tmp_path):
         (worker,) = cluster.workers.values()
         assert (worker.nthreads, worker.memory_manager.memory_limit) == (1, 2 * 1024**3)
     assert list(tmp_path.iterdir())
+
+
+def test_workers_that_may_come_have_their_share_of_memory():
+    described = load_model("kind: local\nadapt: {min: 1, max: 8}\n", "cluster.yaml", Cluster)
+    with clusters.start(described) as cluster:
+        (worker,) = cluster.workers.values()
+        assert worker.memory_manager.memory_limit == MEMORY_LIMIT // 8
+
+
+@pytest.mark.parametrize(("scheduler", "workers", "share"), [("sync", None, 1), ("sync", 4, 1), ("threads", 4, 4)])
+def test_what_runs_at_once_shares_the_memory(scheduler, workers, share):
+    with executor.open_executor(scheduler, workers) as running:
+        assert running.memory_bytes() == MEMORY_LIMIT / share
 
 
 def test_a_cluster_that_begins_without_workers_gets_one():

@@ -5,10 +5,13 @@ import subprocess
 import sys
 
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
 from seamosaic.catalog import images, memory, missions, records
+from seamosaic.catalog.filesystems import ObjectStoreError
 from seamosaic.catalog.images import MissingImage
+from seamosaic.catalog.store import Store
 from seamosaic.schemas.parameters import Parameters
-from seamosaic.workflows import job, products, request, run
+from seamosaic.workflows import footing, job, maps, products, request, run
 
 # What carries results but does not decide them
 NEUTRAL = {
@@ -103,3 +106,31 @@ def test_an_image_that_could_not_be_read_just_then_is_tried_again(reef, tmp_path
 def test_opening_without_reading_gives_no_inputs(reef, hashed):
     opened = missions.open_mission(str(reef.mission), {}, hashed=hashed)
     assert not opened.frames["sha256"].values.any()
+
+
+def test_a_library_that_computes_makes_results_stale(monkeypatch):
+    installed = [name for name, _ in footing.installed(*footing.COMPUTING)]
+    assert {"shapely", "contourpy"} < set(installed)
+    assert any(name.startswith("open3d") for name in installed)
+    version, codes = footing.version, {job.code_version(maps)}
+    for other in installed:
+        monkeypatch.setattr(footing, "version", lambda name, other=other: "0" if name == other else version(name))
+        codes.add(job.code_version(maps))
+        footing.software.cache_clear()
+        assert (other, "0") in footing.software()
+    assert len(codes) == len(installed) + 1
+    monkeypatch.undo()
+    footing.software.cache_clear()
+
+
+def test_cells_are_stale_with_the_tie_points_that_they_are_made_of():
+    assert job.code_version(maps) != maps._VERSION
+
+
+def test_a_worker_whose_store_does_not_answer_now_is_not_refused(monkeypatch):
+    def failing(*_, **__):
+        raise OSError("503: slow down")
+
+    monkeypatch.setattr(MemoryFileSystem, "info", failing)
+    with pytest.raises(ObjectStoreError, match="503"):
+        footing.why_not("memory://nowhere", Store("memory://steps"), footing.Footing(footing.software(), "", ""))

@@ -66,3 +66,16 @@ def test_nothing_is_taken_from_a_version_of_another_format_or_from_none(out):
     assert unchanged.newest(str(out), "reef") is None
     assert unchanged.newest(str(out), "sea") is None
     assert take(out) == (False, [])
+
+
+def test_a_name_that_leads_out_of_the_version_is_not_followed(out):
+    path = out / "reef/v1/metadata/provenance.json"
+    outside = "mosaic/../../../outside.tif"
+    (out / "outside.tif").write_bytes(b"others'")
+    (out / "reef/v1/mosaic").mkdir()
+    sha = hashlib.sha256(b"others'").hexdigest()
+    text = path.read_text().replace('"mosaic.tif":', f'"{outside}": "{sha}", "mosaic.tif":')
+    path.write_text(text)
+    assert outside in text
+    assert take(out) == (True, ["mosaic-source.tif", "mosaic.tif"])
+    assert not (out.parent.parent / "outside.tif").exists()
