@@ -28,7 +28,8 @@ def match(
 ) -> NDArray[np.intp]:
     """Matches (M, 2), numbers of the features in either image, mutual and on the epipolar lines of a motion.
 
-    Those known where there are no more: depth changes too fast there for its neighbours to foretell it.
+    There may be fewer of them than were known, as these have wrong ones among them that lie on their lines by chance;
+    those known where there are next to none.
 
     Parameters
     ----------
@@ -51,8 +52,8 @@ def match(
     rows, candidate, alike = rows[enough], candidate[enough], alike[enough]
     best_of_a, best_of_b = _distinct(rows, alike), _distinct(candidate, alike)
     chosen = best_of_a & best_of_b
-    found_here = np.column_stack([rows[chosen], candidate[chosen]])
-    return found_here if len(found_here) >= len(known) else known
+    led = np.column_stack([rows[chosen], candidate[chosen]])
+    return led if len(led) >= _NEIGHBOURS else known
 
 
 def _in_front(x_a: Array, x_b: Array, known: NDArray[np.intp], found: Motion) -> NDArray[np.bool_]:
