@@ -1,5 +1,5 @@
 # make demo   sets up, makes a small mission, maps it and says where to look
-# make test   sets up, runs the tests (make test-all: the slow ones too)
+# make test   sets up, runs the tests (make test-all: the slow ones too, with their coverage)
 # make setup  leaves .venv/bin/seamosaic
 # make lock   renews requirements.lock after a change to pyproject.toml
 
@@ -29,7 +29,7 @@ demo: setup
 	$(BIN)/seamosaic demo demo
 
 test: setup lint
-	$(BIN)/python -m pytest -n 2 -m "not slow" --cov --cov-report=term
+	$(BIN)/python -m pytest -n 2 -m "not slow"
 
 test-all: setup lint
 	$(BIN)/python -m pytest -n 2 --cov --cov-report=term

@@ -122,6 +122,7 @@ def test_the_shape_of_a_bent_board_is_found():
         assert angle_deg(bent.sheets[s][:3], sheet.normal) < 0.15
 
 
+@pytest.mark.slow
 def test_misprinted_corners_are_released_all_the_way():
     """With poses, lens and shape held while corners move, seven rounds stop far short, and the light is off by more."""
     true = calibration()

@@ -71,7 +71,7 @@ def computed(provenance: dict) -> dict[str, int]:
     return {step["name"]: step["count_computed"] for step in provenance["steps"]}
 
 
-@pytest.mark.parametrize("count", [3, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_the_life_of_an_archive(tmp_path, count):
     folder = make_archive(tmp_path / "archive", count, title="Plains")
     names = [f"plane-{k}" for k in range(count)]

@@ -168,6 +168,7 @@ def test_writing_that_fails_is_a_clear_failure(mission, calm, tmp_path, kilobyte
     assert differing(tmp_path / ID / "v1", calm.path) == []
 
 
+@pytest.mark.slow
 def test_every_stored_result_damaged(mission, calm, tmp_path):
     """Found while a later step is made; the same run makes them anew."""
     shutil.copytree(calm.path.parent / "steps", tmp_path / ID / "steps")

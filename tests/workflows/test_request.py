@@ -92,10 +92,11 @@ def test_an_image_that_could_not_be_read_just_then_is_tried_again(reef, tmp_path
 
     first = sorted((reef.mission / "images").iterdir())[0].name
     monkeypatch.setattr(images, "read_file", once_broken)
-    broken = run.run(str(reef.mission), out, Parameters(), scheduler="sync")
+    quick = Parameters.model_validate({"bathymetry": {"dense": False}, "mosaic": {"cell_m": 0.02}})
+    broken = run.run(str(reef.mission), out, quick, scheduler="sync")
     assert (broken.quality.trajectory.rejected, broken.request) == (1, None)
     monkeypatch.undo()
-    again = run.run(str(reef.mission), out, Parameters(), scheduler="sync")
+    again = run.run(str(reef.mission), out, quick, scheduler="sync")
     assert (again.path.name, again.quality.trajectory.rejected) == ("v2", 0)
     last = records.read_last_run(str(out), again.quality.mission.id)
     assert last is not None
