@@ -16,7 +16,7 @@ from ..tasks.surface import halo_cells
 GIB: Final = 2**30
 _PROCESS: Final = 0.35 * GIB  # Python with all libraries
 _EACH_PIXEL: Final = 20  # of an image while it is measured, bytes
-_EACH_ADJUSTED: Final = 450_000  # of an image in the adjustment, bytes
+_EACH_ADJUSTED: Final = 600_000  # of an image in the adjustment, bytes
 _EACH_CELL: Final = 200  # of a tile of the bathymetry with what surrounds it
 _EACH_TEXEL: Final = 45  # of a tile of the mosaic
 _BESIDES: Final = 0.1 * GIB
