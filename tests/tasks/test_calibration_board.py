@@ -106,6 +106,7 @@ def bent_scene(true, bow_m, count=9, misprint_m=0.0):
     return board.BoardData(corner[ok], data.corner_board[ok], data.corner_image[ok], *light, count), shape
 
 
+@pytest.mark.slow
 def test_the_shape_of_a_bent_board_is_found():
     true = calibration()
     data, shape = bent_scene(true, 0.006)

@@ -38,7 +38,7 @@ def test_what_grows_with_the_mission_and_what_does_not(tiny_mission):
     few, many = (need(tiny_mission, Parameters(), images) for images in (100, 10_000))
     grown = [b.size - a.size for a, b in zip(few, many, strict=True)]
     assert [bool(more) for more in grown] == [False, True, False, False]
-    assert 3.5 < grown[1] / GIB < 5.0
+    assert 4.7 < grown[1] / GIB < 6.0  # 10,000 images with few soundings took 5.1 with Python and all (benchmarks)
 
 
 def test_without_a_limit_nothing_is_refused(tiny_mission):
