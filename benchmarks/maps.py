@@ -18,7 +18,7 @@ from seamosaic.schemas.parameters import Parameters
 from seamosaic.workflows.run import run
 from seamosaic.workflows.simulate import simulate
 
-MAPS = ("dense", "agreement", "cells", "growth", "surface", "lighting", "planar-align", "mosaic", "mesh")
+MAPS = ("ties", "dense", "agreement", "cells", "growth", "surface", "lighting", "planar-align", "mosaic", "mesh")
 LAYERS = ("terrain", "contours")  # on top
 ALTITUDE_M = 4.75  # of a lens of 4,752 px
 

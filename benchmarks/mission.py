@@ -6,7 +6,8 @@ decoding the same JPEG files in the same run; peak resident memory of all proces
 changed, and one with another `grid.cell_m`.
 
 The simulated images are hard links to a few files, and seamosaic would extract each file once. Here every image
-counts as one of its own (`each_image_anew`), as those of a real mission are.
+counts as one of its own (`each_image_anew`), as those of a real mission are. Workers load this file: what they do not
+need is imported where it is used.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import dask
@@ -31,8 +32,9 @@ import psutil
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.schemas.scene import SCENES
 from seamosaic.workflows import extract
-from seamosaic.workflows.run import RunResult, run
-from seamosaic.workflows.simulate import simulate
+
+if TYPE_CHECKING:
+    from seamosaic.workflows.run import RunResult
 
 _SAMPLE_S = 0.5
 
@@ -98,7 +100,9 @@ def core_seconds() -> tuple[float, float]:
     return own.ru_utime + own.ru_stime, others.ru_utime + others.ru_stime
 
 
-def measured(mission: Path, out: Path, parameters: Parameters, workers: int) -> tuple[RunResult, dict[str, float]]:
+def measured(mission: Path, out: Path, parameters: Parameters, workers: int) -> "tuple[RunResult, dict[str, float]]":
+    from seamosaic.workflows.run import run
+
     began, before = time.monotonic(), core_seconds()
     with peak_memory() as peak:
         made = run(str(mission), out, parameters, workers=workers)
@@ -110,6 +114,8 @@ def measured(mission: Path, out: Path, parameters: Parameters, workers: int) -> 
 
 def simulated(folder: Path, images: int, width: int) -> Path:
     """So many images of `full`, on lines of the same shape; kept for the next time."""
+    from seamosaic.workflows.simulate import simulate
+
     mission = folder / f"full-{images}-{width}"
     if not mission.exists():
         whole = SCENES["full"]

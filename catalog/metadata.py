@@ -44,12 +44,15 @@ def multihash(sha256: str) -> str:
     return _MULTIHASH_SHA256 + sha256
 
 
-def output_digests(folder: str | os.PathLike[str]) -> dict[str, str]:
-    """SHA-256 of every file in a version's folder but those of metadata/, which tell of the others."""
-    root = Path(folder)
+def output_digests(folder: str | os.PathLike[str], known: Mapping[str, str] | None = None) -> dict[str, str]:
+    """SHA-256 of every file in a version's folder but those of metadata/, which tell of the others.
+
+    known : of files that need not be read.
+    """
+    root, known = Path(folder), known or {}
     files = sorted(path for path in root.rglob("*") if path.is_file())
     names = [(path.relative_to(root).as_posix(), path) for path in files]
-    return {name: sha256_of(path) for name, path in names if not name.startswith("metadata/")}
+    return {name: known.get(name) or sha256_of(path) for name, path in names if not name.startswith("metadata/")}
 
 
 def software_versions() -> dict[str, str]:
@@ -99,6 +102,7 @@ def write_stac_item(
     title: str,
     start: datetime,
     end: datetime,
+    digests: Mapping[str, str],
     properties: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write metadata/stac-item.json (STAC 1.0) for a version whose map has geographic coordinates.
@@ -109,6 +113,7 @@ def write_stac_item(
     Parameters
     ----------
     start, end : first and last exposure, UTC.
+    digests : SHA-256 of the files, by `output_digests`.
     properties : more properties of the item (license, platform, ...).
     """
     root = Path(folder)
@@ -136,7 +141,7 @@ def write_stac_item(
             **(properties or {}),
         },
         "links": [],
-        "assets": {product.name: _asset(root, product) for product in _present(root)},
+        "assets": {product.name: _asset(root, product, digests) for product in _present(root)},
     }
     path = root / "metadata" / "stac-item.json"
     _write_json(path, item)
@@ -155,7 +160,7 @@ def _present(root: Path) -> Iterable[Product]:
     return (product for product in PRODUCTS if (root / product.name).is_file())
 
 
-def _asset(root: Path, product: Product) -> dict[str, Any]:
+def _asset(root: Path, product: Product, digests: Mapping[str, str]) -> dict[str, Any]:
     path = root / product.name
     asset: dict[str, Any] = {
         "href": f"../{product.name}",
@@ -164,7 +169,7 @@ def _asset(root: Path, product: Product) -> dict[str, Any]:
         "type": product.media_type,
         "roles": [product.role],
         "file:size": path.stat().st_size,
-        "file:checksum": multihash(sha256_of(path)),
+        "file:checksum": multihash(digests.get(product.name) or sha256_of(path)),
     }
     if path.suffix == ".tif":
         with rasterio.open(path) as file:

@@ -83,13 +83,13 @@ def join(parts: Sequence[Contours], cell_m: float) -> Contours:
 
     That is noise, or the point of an extremum.
     """
-    by_level: dict[float, list[shapely.LineString]] = {}
-    for part in parts:
-        for level, line in part.lines():
-            by_level.setdefault(level, []).append(shapely.LineString(line))
-    joined = [
-        (level, shapely.get_coordinates(line))
-        for level, lines in sorted(by_level.items())
-        for line in shapely.get_parts(shapely.line_merge(shapely.MultiLineString(lines)))
-    ]
-    return _contours([(level, line) for level, line in joined if np.ptp(line, axis=0).max() > cell_m])
+    elevation = np.concatenate([np.zeros(0), *(part.elevation for part in parts)])
+    length = np.concatenate([np.zeros(0, int), *(np.diff(part.first) for part in parts)])
+    xy = np.concatenate([np.zeros((0, 2)), *(part.xy for part in parts)])
+    lines = np.asarray(shapely.linestrings(xy, indices=np.repeat(np.arange(len(length)), length)))
+    levels = np.unique(elevation)
+    joined = [shapely.get_parts(shapely.line_merge(shapely.multilinestrings(lines[elevation == z]))) for z in levels]
+    west, south, east, north = shapely.bounds(whole := np.concatenate([lines[:0], *joined])).reshape(-1, 4).T
+    large = np.maximum(east - west, north - south) > cell_m
+    kept, of = whole[large], np.repeat(levels, [len(found) for found in joined])[large]
+    return Contours(of, np.cumsum([0, *shapely.get_num_coordinates(kept)]), shapely.get_coordinates(kept))

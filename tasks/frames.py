@@ -22,7 +22,7 @@ _WGS84 = "EPSG:4326"  # navigation's datum, whatever the map's
 
 
 class LocalAffine(NamedTuple):
-    """The map around one place: local = matrix @ map + offset, good to a micrometre over some tens of metres."""
+    """The map around places: local = matrix @ map + offset, good to a micrometre over some tens of metres."""
 
     matrix: Array
     offset: Array
@@ -89,13 +89,13 @@ class MapFrame:
         return self.local_from_geographic(longitude, latitude, X_map[:, 2])
 
     def affine_at(self, X_map: Array) -> LocalAffine:
-        """The linearised transformation from map to local around one map point (3,)."""
+        """The linearised transformations from map to local around map points (..., 3)."""
         step = 5.0
-        points = X_map + step * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
-        local = self.local_from_map(points)
-        matrix = ((local[1:4] - local[4:7]) / (2 * step)).T
-        return LocalAffine(matrix, local[0] - matrix @ X_map)
+        points = X_map[..., None, :] + step * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
+        local = self.local_from_map(points.reshape(-1, 3)).reshape(points.shape)
+        matrix = (local[..., 1:4, :] - local[..., 4:7, :]).swapaxes(-1, -2) / (2 * step)
+        return LocalAffine(matrix, local[..., 0, :] - (matrix @ X_map[..., None])[..., 0])
 
     def R_map_local(self, X_map: Array) -> Array:
-        """Rotation (3, 3) from local axes to map axes at one map point: the meridian convergence, mostly."""
-        return nearest_rotation(self.affine_at(X_map).matrix.T)
+        """Rotations (..., 3, 3) from local to map axes at map points (..., 3): the meridian convergence, mostly."""
+        return nearest_rotation(self.affine_at(X_map).matrix.swapaxes(-1, -2))

@@ -41,9 +41,10 @@ def angle_between_deg(R_a: Array, R_b: Array) -> float:
 
 
 def nearest_rotation(M: Array) -> Array:
-    """The rotation closest to a (3, 3) matrix in the Frobenius norm."""
+    """The rotations closest to matrices (..., 3, 3) in the Frobenius norm."""
     U, _, Vt = np.linalg.svd(M)
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
+    return U @ Vt
 
 
 def quaternion_angle_deg(a_wxyz: Array, b_wxyz: Array) -> float:

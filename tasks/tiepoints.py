@@ -1,5 +1,6 @@
 """Points of the seabed from matches between two images whose poses are known (source 2, image matching)."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,24 +28,22 @@ class TiePoints(NamedTuple):
     Attributes
     ----------
     X_local : (N, 3) metres.
-    sigma_m : (N,) 1-sigma of the elevation from the matches' own noise.
-    common_sigma_m : (N,) 1-sigma that the points of the pair share, from the error of its poses.
+    range_m : (N,) from the first image.
     metres_per_px : (N,) by which a pixel's error along the baseline moves a point.
     """
 
     X_local: Array
-    sigma_m: Array
-    common_sigma_m: Array
+    range_m: Array
     metres_per_px: Array
 
+    @property
+    def sigma_m(self) -> Array:
+        """(N,) 1-sigma of the elevation from the matches' own noise."""
+        return _MATCH_SIGMA_PX * math.sqrt(2) * self.metres_per_px
 
-def triangulate(
-    camera: Camera, uv_i: Array, uv_j: Array, poses: Poses, i: int, j: int, pose_sigma_px: float
-) -> TiePoints:
-    """Points midway where the rays of matches (M, 2) in pixels pass each other; rays that miss are left out.
 
-    pose_sigma_px : what the two poses may be wrong by, as an error of pixels along the baseline.
-    """
+def triangulate(camera: Camera, uv_i: Array, uv_j: Array, poses: Poses, i: int, j: int) -> TiePoints:
+    """Points midway where the rays of matches (M, 2) in pixels pass each other; rays that miss are left out."""
     (o_i, d_i), (o_j, d_j) = (_local_rays(camera, uv, poses, k) for uv, k in ((uv_i, i), (uv_j, j)))
     between, cosine = o_j - o_i, np.einsum("nk,nk->n", d_i, d_j)
     along_i, along_j = np.einsum("nk,nk->n", between, d_i), np.einsum("nk,nk->n", between, d_j)
@@ -56,17 +55,18 @@ def triangulate(
     gap_px = np.linalg.norm(P_i - P_j, axis=1) / np.maximum(range_i, 1e-6) * focal
     parallax = np.sqrt(sine_squared)
     keep = (range_i > 0) & (range_j > 0) & (gap_px < _MAX_GAP_PX) & (parallax > _MIN_PARALLAX)
-    distance, parallax = range_i[keep], parallax[keep]
-    metres_per_px = distance / parallax / focal
-    found = TiePoints(
-        X_local=(P_i[keep] + P_j[keep]) / 2,
-        sigma_m=_MATCH_SIGMA_PX * np.sqrt(2) * metres_per_px,
-        common_sigma_m=pose_sigma_px * metres_per_px,
-        metres_per_px=metres_per_px,
-    )
-    certain = np.hypot(found.sigma_m, found.common_sigma_m) < _WORST_SIGMA * distance
-    found = TiePoints(*(values[certain] for values in found))
+    distance = range_i[keep]
+    found = certain(TiePoints((P_i[keep] + P_j[keep]) / 2, distance, distance / parallax[keep] / focal))
     return TiePoints(*(values[_like_neighbours(found)] for values in found))
+
+
+def certain(points: TiePoints, pose_sigma_px: float = 0.0) -> TiePoints:
+    """Those that are known well enough to say more than their surroundings do.
+
+    pose_sigma_px : what the poses may be wrong by, as an error of pixels along the baseline.
+    """
+    kept = np.hypot(points.sigma_m, pose_sigma_px * points.metres_per_px) < _WORST_SIGMA * points.range_m
+    return TiePoints(*(values[kept] for values in points))
 
 
 def _like_neighbours(points: TiePoints) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Per pair of images: dense matching, reduced to map cells; and how well matching agrees with the laser."""
+"""Per pair of images: its tie points, and dense matching, reduced to map cells; how well both agree with the laser."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -11,11 +11,11 @@ import numpy as np
 from ..tasks import dense, dense_cells, dense_refine, laser, tiepoints
 from ..tasks.dense_cells import PairCells
 from . import extract, match, solve
-from .job import Done, Made, code_version, load, once, stage
+from .job import Done, Made, code_version, load, once, rounded_digest, stage
 from .maps_inputs import Image, MapJob, Pair, pose_digest
 from .solve import Solution
 
-STEP, AGREEMENT = "dense", "agreement"
+TIES, STEP, AGREEMENT = "ties", "dense", "agreement"
 _VERSION = code_version(sys.modules[__name__])
 _WIDTH_PX = 1200  # of the images that are matched, at most; they are at least halved
 _DEPTH_SHARE = 0.005  # of what is known of the depth is left out at either end
@@ -27,14 +27,32 @@ _DENSE_PX, _TIE_PX, UNKNOWN_M = 0.5, 1.0, 1.0
 
 
 class DensePair(NamedTuple):
-    """Two images to match densely and the key of their match."""
+    """Two images to match densely and the key of their tie points."""
 
     i: Image
     j: Image
-    match: str
+    ties: str
 
 
 _Views = Callable[[Image], tuple[np.ndarray, np.ndarray]]
+
+
+def ties_batch(m: MapJob, batch: Sequence[Pair]) -> list[Done]:
+    """Triangulate the matches of some pairs."""
+    poses, camera = solve.solution(m.job, m.adjusted).poses, m.job.calibration.camera
+
+    def one(pair: Pair) -> Done:
+        def make() -> Made:
+            arrays = load(m.job, match.STEP, pair.key, ("uv_i", "uv_j")).arrays
+            uv_i, uv_j = (arrays[name].astype(float) for name in ("uv_i", "uv_j"))
+            points = tiepoints.triangulate(camera, uv_i, uv_j, poses, pair.i, pair.j)
+            return Made(points._asdict(), {"points": len(points.X_local)})
+
+        both = [pair.i, pair.j]
+        inputs = [pair.key, rounded_digest(poses.R_local_camera[both], poses.C_local[both])]
+        return once(m.job, TIES, _VERSION, inputs, stage(camera), make)
+
+    return [one(pair) for pair in batch]
 
 
 def dense_batch(m: MapJob, batch: Sequence[DensePair]) -> list[Done]:
@@ -44,7 +62,7 @@ def dense_batch(m: MapJob, batch: Sequence[DensePair]) -> list[Done]:
     view = lru_cache(_IMAGES_KEPT)(lambda image: _view(m, image))
 
     def one(pair: DensePair) -> Done:
-        inputs = [pair.i.key, pair.j.key, pair.match, pose_digest(solution, (pair.i.row, pair.j.row))]
+        inputs = [pair.i.key, pair.j.key, pair.ties, pose_digest(solution, (pair.i.row, pair.j.row))]
         parameters = [m.frame.crs, m.frame.latitude, m.frame.longitude, m.cell_m, *stage(m.job.calibration.camera)]
         return once(m.job, STEP, _VERSION, inputs, parameters, lambda: _make(m, pair, solution, view), True)
 
@@ -70,7 +88,7 @@ def _scale(m: MapJob) -> int:
 
 def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
     camera, poses, (i, j) = m.job.calibration.camera, solution.poses, (pair.i.row, pair.j.row)
-    known = np.concatenate([_ties(m, pair, solution).X_local, *(sounded(m, k, solution) for k in (pair.i, pair.j))])
+    known = np.concatenate([tie_points(m, pair.ties).X_local, *(sounded(m, k, solution) for k in (pair.i, pair.j))])
     nothing = Made({}, {"cells": 0})
     axes = dense.rectified_axes(poses, i, j)
     if not len(known) or axes is None:
@@ -103,15 +121,10 @@ def sounded(m: MapJob, image: Image, solution: Solution) -> np.ndarray:
     return X @ solution.poses.R_local_camera[image.row].T + solution.poses.C_local[image.row]
 
 
-def _ties(m: MapJob, pair: DensePair, solution: Solution) -> tiepoints.TiePoints:
-    return tie_points(m, Pair(pair.i.row, pair.j.row, pair.match), solution, _TIE_PX)
-
-
-def tie_points(m: MapJob, pair: Pair, solution: Solution, pose_sigma_px: float) -> tiepoints.TiePoints:
-    """The tie points of a pair."""
-    arrays = load(m.job, match.STEP, pair.key, ("uv_i", "uv_j")).arrays
-    uv_i, uv_j = (arrays[name].astype(float) for name in ("uv_i", "uv_j"))
-    return tiepoints.triangulate(m.job.calibration.camera, uv_i, uv_j, solution.poses, pair.i, pair.j, pose_sigma_px)
+def tie_points(m: MapJob, key: str, pose_sigma_px: float = _TIE_PX) -> tiepoints.TiePoints:
+    """The tie points of a pair that are known well enough. pose_sigma_px : what its poses may be wrong by."""
+    arrays = load(m.job, TIES, key).arrays
+    return tiepoints.certain(tiepoints.TiePoints(**arrays), pose_sigma_px)
 
 
 def read_cells(m: MapJob, key: str) -> PairCells:
@@ -137,7 +150,7 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
         for pair, key, around in pairs:
             near, within = solution.poses.C_local[pair.i.row], _WITHIN_CELLS * m.cell_m
             lit = [m.frame.map_around(sounded(m, image, solution), near) for image in around]
-            ties = _ties(m, pair, solution)
+            ties = tie_points(m, pair.ties)
             there = m.frame.map_around(ties.X_local, near)
             tie_off.append(dense_cells.differences(there, ties.metres_per_px, np.concatenate(lit), within))
             if key:
@@ -156,9 +169,9 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
     rows = sorted({image.row for pair, _, around in pairs for image in (pair.i, pair.j, *around)})
     inputs = [pose_digest(solution, rows)]
     for pair, key, around in pairs:
-        inputs += [pair.match, key, *(image.key for image in around)]
+        inputs += [pair.ties, key, *(image.key for image in around)]
     place = [m.frame.crs, m.frame.latitude, m.frame.longitude]
     return once(m.job, AGREEMENT, _VERSION, inputs, [*place, m.cell_m, *stage(m.job.calibration.camera)], make)
 
 
-VERSIONS = dict.fromkeys((STEP, AGREEMENT), _VERSION)
+VERSIONS = dict.fromkeys((TIES, STEP, AGREEMENT), _VERSION)

@@ -21,7 +21,7 @@ _GROWTH_CELLS = 6 * 512 * 512
 _RELIEF_SHARE = 0.3
 _WORST_SIGMA = 1 / 75  # of the range: what interpolation knows less of it does not know
 _LEAST_SEEN = 0.91  # of the ground that images see: where that is mapped, what is less certain stays empty
-_PAIRS_A_BATCH = 8
+_TIES_A_BATCH, _PAIRS_A_BATCH = 64, 8
 _AGREEMENT_PAIRS = 60
 
 
@@ -159,13 +159,20 @@ class _Pairs:
 def _dense(
     state: Session, m: MapJob, posed: Posed, images: Sequence[Image], outlines: np.ndarray, ranges: np.ndarray
 ) -> tuple[list[Pair], Done]:
-    """The linked pairs, some of them with their dense matching, and how well matching agrees with the laser."""
-    for step in (dense.STEP, dense.AGREEMENT):
+    """The linked pairs with their tie points, some with dense matching, and how well matching agrees with the laser."""
+    for step in (dense.TIES, dense.STEP, dense.AGREEMENT):
         state.ledger.begin(step)
     linked, by_row = _linked(posed), {image.row: image for image in images}
     linked = [pair for pair in linked if pair.i in by_row and pair.j in by_row]
+    tasks = [
+        delayed(dense.ties_batch)(m, batch, dask_key_name=state.key("ties", k))
+        for k, batch in enumerate(batches(linked, _TIES_A_BATCH))
+    ]
+    ties: list[Done] = [done for part in compute(state, dense.TIES, tasks) for done in part]
+    state.ledger.end(dense.TIES, ties)
+    linked = [pair._replace(ties=done.key) for pair, done in zip(linked, ties, strict=True)]
     wanted = _wanted(state, posed, linked, outlines, ranges)
-    described = [dense.DensePair(by_row[pair.i], by_row[pair.j], pair.key) for pair in wanted]
+    described = [dense.DensePair(by_row[pair.i], by_row[pair.j], pair.ties) for pair in wanted]
     tasks = [
         delayed(dense.dense_batch)(m, batch, dask_key_name=state.key("dense", k))
         for k, batch in enumerate(batches(described, _PAIRS_A_BATCH))
@@ -176,7 +183,7 @@ def _dense(
     every = max(1, -(-len(chosen) // _AGREEMENT_PAIRS))
     sampled = [
         (
-            dense.DensePair(by_row[pair.i], by_row[pair.j], pair.key),
+            dense.DensePair(by_row[pair.i], by_row[pair.j], pair.ties),
             keys.get((pair.i, pair.j), ""),
             _beside(posed, by_row, pair),
         )

@@ -31,7 +31,7 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
     # what was found and not from what: another image elsewhere is no reason to make this tile anew
     said = [agreed.info[name] for name in ("dense_px", "tie_px")] + [round(_bend_m(solution, agreed), 4)]
     inputs = [f"{image.row}:{image.key}" for image in tile.images] + [pose_digest(solution, rows_of(tile))]
-    inputs += [f"{pair.i}-{pair.j}:{pair.key}:{pair.dense}" for pair in tile.pairs]
+    inputs += [f"{pair.i}-{pair.j}:{pair.ties}:{pair.dense}" for pair in tile.pairs]
 
     def make() -> Made:
         count = len(solution.sigma_m)
@@ -103,9 +103,9 @@ def _laser(m: MapJob, image: Image, solution: Solution) -> Soundings:
 
 
 def _matched(m: MapJob, pair: Pair, solution: Solution, tie_px: float) -> Soundings:
-    points = dense.tie_points(m, pair, solution, tie_px)
+    points = dense.tie_points(m, pair.ties, tie_px)
     X = m.frame.map_around(points.X_local, solution.poses.C_local[pair.i])
-    return _soundings(X, points.sigma_m, MATCHING, pair.i, points.common_sigma_m)
+    return _soundings(X, points.sigma_m, MATCHING, pair.i, tie_px * points.metres_per_px)
 
 
 def _dense(m: MapJob, pair: Pair, images: int, dense_px: float) -> Soundings:

@@ -27,11 +27,12 @@ class Image(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """Two linked images, the key of their match and that of their dense matching, "" without."""
+    """Two linked images, the keys of their match, of their tie points and of their dense matching, "" without."""
 
     i: int
     j: int
     key: str
+    ties: str = ""
     dense: str = ""
 
 

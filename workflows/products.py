@@ -2,6 +2,7 @@
 
 import re
 import sys
+from collections import ChainMap
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -22,6 +23,7 @@ from ..schemas.mission import Mission
 from ..schemas.products import Quality
 from ..schemas.provenance import InputFile, Provenance
 from ..tasks import contours, derivatives, rotations
+from ..tasks.frames import MapFrame
 from ..tasks.grids import Grid
 from ..tasks.rings import rings
 from . import (
@@ -72,28 +74,27 @@ def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
     parts = _parts(results, crs_wkt)
     rows, navigation = _trajectory(results)
     trajectories.write(folder / "trajectory.csv", rows)
+    taken = {part: unchanged.take(before, folder, part, made) for part, made in parts.items()}
     wanted = [_write_bathymetry, _write_terrain]
-    if not unchanged.take(before, folder, "mosaics", parts["mosaics"]):
-        wanted += [_write_mosaic, _write_planar]
-    if not unchanged.take(before, folder, "soundings", parts["soundings"]):
-        wanted.append(_write_soundings)
+    wanted += [] if taken["mosaics"] else [_write_mosaic, _write_planar]
+    wanted += [] if taken["soundings"] else [_write_soundings]
     _side_by_side(wanted, results, folder, crs_wkt)
-    triangles = before.quality.mesh if before else None
-    if triangles is None or not unchanged.take(before, folder, "mesh", parts["mesh"]):
-        triangles = mesh_products.write(results, folder, crs_wkt)
+    triangles = before.quality.mesh if before and taken["mesh"] else None
+    triangles = triangles or mesh_products.write(results, folder, crs_wkt)
     _write_survey(results, folder, crs_wkt, rows)
     count = sum(done.info["soundings"] for done, _ in _sounded(results))
     figures = quality.figures(results, folder, rows, navigation, count, triangles)
     metadata.write_quality(folder / "quality.json", figures)
     provenance = _provenance(results, made_from)
     report.write_report(folder, figures, provenance, None if results.plan.prior is None else navigation)
-    provenance = provenance.model_copy(update={"parts": parts, "outputs": metadata.output_digests(folder)})
+    digests = metadata.output_digests(folder, dict(ChainMap(*taken.values())))
+    provenance = provenance.model_copy(update={"parts": parts, "outputs": digests})
     metadata.write_provenance(folder / "metadata" / "provenance.json", provenance)
     if results.opened.crs is not None:  # last: it lists all other files
         start, end = span(results.opened)
         mission = results.opened.mission
         number = versions.next_number(results.out, mission.id)
-        metadata.write_stac_item(folder, mission.id, number, mission.title, start, end, _about(mission))
+        metadata.write_stac_item(folder, mission.id, number, mission.title, start, end, digests, _about(mission))
     return figures
 
 
@@ -149,28 +150,29 @@ def _trajectory(results: Results) -> tuple[list[trajectories.Row], np.ndarray]:
     C_map = _map_points(frame, solution.poses.C_local)
     prior = results.plan.prior
     navigation = np.full_like(C_map, np.nan) if prior is None else _map_points(frame, prior.poses.C_local)
-    rows = []
-    for k, state in enumerate(status):
-        pose = None if state.startswith("rejected") else _row_pose(frame, solution, C_map[k], k)
-        rows.append(trajectories.Row(str(frames["image"].values[k]), frames["time"].values[k], pose, state))
+    placed = [k for k, state in enumerate(status) if not state.startswith("rejected")]
+    poses = dict(zip(placed, _poses(frame, solution, C_map, placed), strict=True))
+    taken = zip(frames["image"].values.tolist(), frames["time"].values, status, strict=True)
+    rows = [trajectories.Row(image, time, poses.get(k), state) for k, (image, time, state) in enumerate(taken)]
     return rows, navigation
 
 
-def _row_pose(frame: Any, solution: Solution, C_map: np.ndarray, k: int) -> trajectories.Pose:
-    R_map_local = np.eye(3) if frame.crs is None else frame.R_map_local(C_map)
-    w, x, y, z = rotations.quaternion_wxyz(R_map_local @ solution.poses.R_local_camera[k]).tolist()
-    sigma_x, sigma_y, sigma_z = _along_map_axes(solution, R_map_local, k)
-    return trajectories.Pose((C_map[0], C_map[1], C_map[2]), (w, x, y, z), (sigma_x, sigma_y, sigma_z))
+def _poses(frame: MapFrame, solution: Solution, C_map: np.ndarray, rows: Sequence[int]) -> Iterator[trajectories.Pose]:
+    R_map_local = frame.R_map_local(C_map[rows])
+    quaternions = rotations.quaternion_wxyz(R_map_local @ solution.poses.R_local_camera[rows])
+    sigmas = _along_map_axes(solution, R_map_local, rows)
+    for place, turn, sigma in zip(C_map[rows].tolist(), quaternions.tolist(), sigmas.tolist(), strict=True):
+        yield trajectories.Pose(tuple(place), tuple(turn), tuple(sigma))
 
 
-def _along_map_axes(solution: Solution, R_map_local: np.ndarray, k: int) -> list[float]:
-    """1-sigma of a camera's centre: near a pole the map's axes lie any way to east and north."""
-    local = np.diag(solution.sigma_m[k] ** 2)
-    local[0, 1] = local[1, 0] = solution.covariance_xy_m2[k]
-    return np.sqrt(np.diag(R_map_local @ local @ R_map_local.T)).tolist()
+def _along_map_axes(solution: Solution, R_map_local: np.ndarray, rows: Sequence[int]) -> np.ndarray:
+    """1-sigma (n, 3) of the cameras' centres: near a pole the map's axes lie any way to east and north."""
+    local = solution.sigma_m[rows, None] ** 2 * np.eye(3)
+    local[:, 0, 1] = local[:, 1, 0] = solution.covariance_xy_m2[rows]
+    return np.sqrt(np.einsum("nij,njk,nik->ni", R_map_local, local, R_map_local))
 
 
-def _map_points(frame: Any, local: np.ndarray) -> np.ndarray:
+def _map_points(frame: MapFrame, local: np.ndarray) -> np.ndarray:
     known = np.isfinite(local).all(1)
     points = np.full_like(local, np.nan)
     points[known] = frame.map_from_local(local[known])

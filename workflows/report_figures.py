@@ -188,7 +188,7 @@ def sigma_histogram(soundings: Path) -> Figure | None:
         for points in file.chunk_iterator(_BATCH):
             # what lies beyond is counted in the last bar
             sigma_mm = np.clip(np.asarray(points["sigma"], float) * 1000, 0, edges_mm[-1])
-            counts += np.histogram(sigma_mm, edges_mm)[0]
+            counts += np.histogram(sigma_mm, len(counts), (0, edges_mm[-1]))[0]
     if not counts.any():
         return None
     last = int(np.flatnonzero(counts)[-1]) + 2

@@ -44,22 +44,26 @@ def _text(path: Folder) -> str:
         return path.read_text(encoding="utf-8")
 
 
-def take(before: Newest | None, folder: Path, part: str, made_from: str) -> bool:
-    """Copy a part's files from the newest version, if it has them whole and made from the same; whether it did.
+def take(before: Newest | None, folder: Path, part: str, made_from: str) -> dict[str, str]:
+    """Copy a part's files from the newest version, if it has them whole and made from the same.
 
     Parameters
     ----------
     part : one of PARTS. made_from : the digest that stands for it.
+
+    Returns
+    -------
+    SHA-256 of the files that were copied, by name; none if they have to be made.
     """
     if before is None or before.provenance.parts.get(part) != made_from:
-        return False
+        return {}
     outputs = before.provenance.outputs.items()
     files = {name: sha for name, sha in outputs if fnmatch(name, PARTS[part]) and _is_inside(name)}
-    copied = all(_copy(before.folder / name, folder / name, sha) for name, sha in files.items())
-    if not copied:
-        for name in files:
-            (folder / name).unlink(missing_ok=True)
-    return copied and bool(files)
+    if all(_copy(before.folder / name, folder / name, sha) for name, sha in files.items()):
+        return files
+    for name in files:
+        (folder / name).unlink(missing_ok=True)
+    return {}
 
 
 def _is_inside(name: str) -> bool:

@@ -75,7 +75,7 @@ def version(folder, crs):
         writer.write(0, 0, np.full((40, 60), -3.0))
     (folder / "trajectory.csv").write_text("image")
     return json.loads(
-        metadata.write_stac_item(folder, "reef", 3, "A reef", START, END, {"platform": "Vortex"}).read_text()
+        metadata.write_stac_item(folder, "reef", 3, "A reef", START, END, {}, {"platform": "Vortex"}).read_text()
     )
 
 

@@ -25,7 +25,8 @@ def make_version(products, mission_id, number, crs="EPSG:32631", left=25_000_000
         with rasters.product_writer(folder, "bathymetry.tif", 0.02, left, 236_000_000, 60, 40, wkt) as writer:
             writer.write(0, 0, np.full((40, 60), -3.0))
         about = {"platform": "Vortex", "license": "CC-BY-4.0"}
-        metadata.write_stac_item(folder, mission_id, number, "A reef", START, END, about)
+        digests = metadata.output_digests(folder)
+        metadata.write_stac_item(folder, mission_id, number, "A reef", START, END, digests, about)
     (folder / versions.PROVENANCE).write_text(json.dumps({"digest": str(number), "created": "2026-06-04T00:00:00Z"}))
     return folder
 

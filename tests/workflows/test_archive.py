@@ -107,7 +107,7 @@ def test_the_life_of_an_archive(tmp_path, count):
     assert states(folder)["plane-0"] == ("current", 1)
     for name in chosen:
         counts = computed(provenance(folder, name, 2))
-        assert [counts[step] for step in ("extract", "match", "adjust", "dense", "agreement")] == [0] * 5
+        assert [counts[step] for step in ("extract", "match", "adjust", "ties", "dense", "agreement")] == [0] * 6
         assert counts["surface"] > 0
     # the next scheduled run leaves it so
     assert {one.outcome for one in run_archive(open_archive(str(folder)), SYNC).missions} == {"current"}

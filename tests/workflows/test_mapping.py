@@ -60,4 +60,5 @@ def test_sigmas_are_along_the_axes_of_the_map(turn_deg: float):
     R_map_local = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
     drawn = rng.normal(size=(200_000, 3)) @ root.T @ R_map_local.T
     solution = SimpleNamespace(sigma_m=np.sqrt(np.diag(covariance))[None], covariance_xy_m2=covariance[None, 0, 1])
-    assert products._along_map_axes(solution, R_map_local, 0) == pytest.approx(drawn.std(0), rel=0.01)  # pyright: ignore[reportArgumentType]
+    (sigma,) = products._along_map_axes(solution, R_map_local[None], [0])  # pyright: ignore[reportArgumentType]
+    assert sigma == pytest.approx(drawn.std(0), rel=0.01)

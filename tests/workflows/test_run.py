@@ -242,7 +242,7 @@ def test_another_cell_size_makes_the_bathymetry_only(reef, tmp_path, monkeypatch
     parameters = Parameters.model_validate({"grid": {"cell_m": 0.05}})
     result = run(str(reef.mission), out, parameters, scheduler="sync")
     computed = _computed(result)
-    kept = ("extract", "match", "adjust", "dense", "agreement", "lighting", "planar-align", "mosaic", "mesh")
+    kept = ("extract", "match", "adjust", "ties", "dense", "agreement", "lighting", "planar-align", "mosaic", "mesh")
     assert {step: computed[step] for step in kept} == dict.fromkeys(kept, 0)
     assert computed["cells"] > 0
     assert result.path.name == "v2"
