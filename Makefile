@@ -6,7 +6,8 @@
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
-# the certificates of the machine, not uv's own; pip takes over where uv cannot reach the index
+# the certificates of the machine, not uv's own; pip takes over where uv cannot reach the index. Compiled as pip does it,
+# once: else each process does, 8 seconds, where the environment says PYTHONDONTWRITEBYTECODE
 INSTALL := $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python
 
 # small matrices, two test processes: threads of the linear algebra would only wait for each other
@@ -21,7 +22,7 @@ setup: $(VENV)/.ready
 $(VENV)/.ready: requirements.lock requirements-uv.lock pyproject.toml
 	$(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements-uv.lock
-	$(INSTALL) --require-hashes -r requirements.lock || $(BIN)/pip install --quiet --require-hashes -r requirements.lock
+	$(INSTALL) --compile-bytecode --require-hashes -r requirements.lock || $(BIN)/pip install --quiet --require-hashes -r requirements.lock
 	$(INSTALL) --no-deps --no-build-isolation --editable .
 	touch $@
 
