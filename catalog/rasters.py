@@ -228,7 +228,8 @@ class RasterWriter:
         }
         if self.layer.mask:
             return common | {"COMPRESS": "JPEG", "QUALITY": str(_JPEG_QUALITY), "OVERVIEW_QUALITY": str(_JPEG_QUALITY)}
-        return common | {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "SPARSE_OK": "YES", "STATISTICS": "YES"}
+        quantity = "YES" if self.layer.resampling == "average" else "NO"  # codes and numbers have no mean
+        return common | {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "SPARSE_OK": "YES", "STATISTICS": quantity}
 
 
 def gdal_settings() -> rasterio.Env:

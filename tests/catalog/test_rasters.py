@@ -55,6 +55,7 @@ def test_every_product_is_a_strictly_valid_cog(tmp_path, name):
         assert file.crs.to_epsg() == 32631
         if not layer.mask:
             np.testing.assert_array_equal(file.read(), ramp(name))
+        if layer.resampling == "average" and not layer.mask:
             assert float(file.tags(1)["STATISTICS_MAXIMUM"]) == pytest.approx(ramp(name).max(), rel=1e-5)
     files = [entry.relative_to(tmp_path).as_posix() for entry in tmp_path.rglob("*") if entry.is_file()]
     assert files == [name], "a temporary or side file is left"
