@@ -13,11 +13,10 @@ from ..schemas.expressions import MISSION_NAMES, Row, compile_expression
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.yaml_input import load_model, load_parameters
-from .filesystems import ObjectStoreError, absolute, asking, connect, entries
+from .filesystems import ObjectStoreError, absolute, asking, connect, entries, is_glob
 from .mission_inputs import MISSION
 
 ARCHIVE: Final = "archive.yaml"
-_MAGIC: Final = "*?["
 
 
 class OpenedArchive(NamedTuple):
@@ -126,7 +125,7 @@ def _matching(url: str, pattern: str) -> list[str]:
     filesystem, path = connect(pattern if _is_whole(pattern) else url)
     parts = [part for part in (path if _is_whole(pattern) else pattern).split("/") if part not in ("", ".")]
     start = ("/" if path.startswith("/") else "") if _is_whole(pattern) else f"{path.rstrip('/')}/"
-    fixed = next((i for i, part in enumerate(parts) if any(sign in part for sign in _MAGIC)), len(parts))
+    fixed = next((i for i, part in enumerate(parts) if is_glob(part)), len(parts))
     found = _folders(filesystem, start + "/".join(parts[:fixed]), parts[fixed:], pattern)
     missions = [folder for folder in dict.fromkeys(found) if _is_mission(filesystem, folder)]
     if isinstance(filesystem, LocalFileSystem):

@@ -115,6 +115,11 @@ def settle(path: str | os.PathLike[str]) -> None:
             raise
 
 
+def is_glob(text: str) -> bool:
+    """Whether a path, or a part of one, has signs that a glob expands."""
+    return any(sign in text for sign in "*?[")
+
+
 def entries(fs: AbstractFileSystem, folder: str, what: str) -> dict[str, dict[str, Any]]:
     """What is in a folder, by path. One request; every trouble is raised, which fsspec's find and glob pass over."""
     with asking(fs, what):

@@ -12,9 +12,7 @@ from ..schemas.mission import Mission
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.yaml_document import Document
 from .digests import file_key, sha256
-from .filesystems import ObjectStoreError, absolute, asking, connect, entries, is_remote
-
-_MAGIC = "*?["
+from .filesystems import ObjectStoreError, absolute, asking, connect, entries, is_glob, is_remote
 
 
 class ImageFile(NamedTuple):
@@ -86,7 +84,7 @@ class MissionFiles:
         The folder's own name may hold such characters, which fsspec's glob would expand; so we match ourselves.
         """
         parts = pattern.split("/")
-        fixed = next((i for i, part in enumerate(parts) if any(sign in part for sign in _MAGIC)), len(parts) - 1)
+        fixed = next((i for i, part in enumerate(parts) if is_glob(part)), len(parts) - 1)
         found = self._files("/".join(parts[:fixed]), None if "**" in parts else len(parts) - fixed)
         return {name: entry for name, entry in sorted(found.items()) if _matches(name.split("/"), parts)}
 
@@ -102,7 +100,7 @@ class MissionFiles:
     def folder_of(self, pattern: str) -> list[str]:
         """Names of the files in the folder in which a pattern looks, for a message."""
         folder = pattern.rpartition("/")[0]
-        if any(sign in folder for sign in _MAGIC):
+        if is_glob(folder):
             folder = ""
         return sorted(self._files(folder, 1))
 

@@ -9,12 +9,11 @@ from fsspec import AbstractFileSystem
 from fsspec.implementations.local import LocalFileSystem
 
 from . import json_files, leases
-from .filesystems import ObjectStoreError, asking, connect
+from .filesystems import ObjectStoreError, asking, connect, is_glob
 
 STEPS: Final = "steps"
 _SCRATCH: Final = ".tmp"  # of Store
 _BATCH: Final = 1000  # what S3 removes at once
-_MAGIC: Final = "*?["  # which fsspec would expand
 _MODIFIED: Final = ("mtime", "LastModified", "last_modified", "updated", "created")
 
 
@@ -110,7 +109,7 @@ def _is_half(path: str) -> bool:
 
 def _remove(filesystem: AbstractFileSystem, paths: Sequence[str], lease: leases.Lease) -> str:
     """Remove files, many with one request where that can be, as long as the lease is ours; why some are not removed."""
-    why, single = "", isinstance(filesystem, LocalFileSystem) or any(sign in paths[0] for sign in _MAGIC)
+    why, single = "", isinstance(filesystem, LocalFileSystem) or is_glob(paths[0])  # as fsspec would take it
     count = 1 if single else _BATCH
     for start in range(0, len(paths), count):
         if lease.lost.is_set():

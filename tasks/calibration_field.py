@@ -261,7 +261,7 @@ def _two_rays(slopes_i: Array, slopes_j: Array, at: Posed, i: Indices, j: Indice
 
 
 def _depths(ray_i: Array, turned: Array, t: Array) -> Array:
-    """Depths (M, 2) along both rays where these come closest, as `motion.depths`."""
+    """Depths (M, 2) along both rays where these come closest, as `epipolar.depths`."""
     a, b, c = (ray_i**2).sum(1), (ray_i * turned).sum(1), (turned**2).sum(1)
     e, f = (ray_i * t).sum(1), (turned * t).sum(1)
     determinant = np.maximum(a * c - b * b, 1e-12)

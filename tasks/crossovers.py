@@ -121,16 +121,16 @@ def find(poses: Poses, made: Lines) -> Crossovers:
     sigma = np.hypot(at(p, f, node_sigma), at(q, g, node_sigma))
     line = image * 2 + arm
     slope, doubt = _gradient(_tangent(X, line, p), _tangent(X, line, q), sigma)
-    normal = normals(slope, doubt)
-    return Crossovers(
+    crossed = Crossovers(
         i=image[p[:, 0]],
         j=image[q[:, 0]],
         a=at(p, f, X_camera),
         b=at(q, g, X_camera),
-        normal=normal,
-        apart_m=((at(q, g, X) - at(p, f, X)) * normal).sum(1),
+        normal=normals(slope, doubt),
+        apart_m=np.zeros(len(sigma)),
         sigma_m=sigma,
     )
+    return apart(poses, crossed)
 
 
 def _tangent(X: Array, line: Indices, ends: Indices) -> Array:
@@ -164,7 +164,7 @@ def normals(slope: Array, sigma: Array) -> Array:
 
 
 def apart(poses: Poses, found: Crossovers) -> Crossovers:
-    """The same crossings with how far the lines are apart by other poses."""
+    """The same crossings with how far the lines are apart by these poses."""
     X_i, X_j = (
         np.einsum("kij,kj->ki", poses.R_local_camera[k], X) + poses.C_local[k]
         for k, X in ((found.i, found.a), (found.j, found.b))

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from .epipolar import depths, sampson
 from .features import Features, unit_root
-from .motion import Motion, depths, sampson
+from .motion import Motion
 
 Array = NDArray[Any]
 

@@ -11,17 +11,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.spatial import KDTree
 
 from ..schemas.parameters import MatchParameters
+from .epipolar import depths, distances, essential, homogeneous, sampson
+from .motion_scale import laser_scale
 from .navigation import RelativePrior
 from .robust_minimum import HUBER, Minimum, minimise
 
 Array = NDArray[Any]
 
 _PIXEL_SIGMA = 0.5  # of a SIFT match, pixels at full resolution
-_SCALE_RADIUS = 0.03  # slope within which a sounding tells a feature's depth: 9 cm at 3 m
-_MIN_SCALE_FEATURES = 5
 _LASER_CONTRADICTS = 0.1  # spread of the depth ratios beyond which a motion is not the right one
 _UNIT_LENGTH_SIGMA = 1e-3
 _MAX_MATCHES = 300
@@ -189,7 +188,7 @@ def _from_unknown_plane(x_i: Array, x_j: Array, focal_px: float, parameters: Mat
     starts = []
     for R_j_i, t_j_i, normal in zip(rotations, translations, normals, strict=True):
         length = float(np.linalg.norm(t_j_i))
-        if length > 1e-6 and (_homogeneous(x_i[inliers]) @ normal.ravel() > 0).mean() > 0.5:
+        if length > 1e-6 and (homogeneous(x_i[inliers]) @ normal.ravel() > 0).mean() > 0.5:
             starts.append(_Start(R_j_i.T, -R_j_i.T @ t_j_i.ravel() / length, inliers))
     return starts
 
@@ -253,10 +252,6 @@ def _moved(start_R: Array, start_t: Array, step: Array) -> tuple[Array, Array]:
     return start_R @ cv2.Rodrigues(step[:3])[0], start_t + start_R @ step[3:]
 
 
-def _homogeneous(x: Array) -> Array:
-    return np.column_stack([x, np.ones(len(x))])
-
-
 def _thin(inliers: NDArray[np.intp]) -> NDArray[np.intp]:
     return inliers[:: max(1, len(inliers) // _MAX_MATCHES)]
 
@@ -276,7 +271,7 @@ def _refine_on_plane(
 
     def transfer(step: Array, chosen: NDArray[np.intp]) -> Array:
         R, t = _moved(start.R_i_j, start.t_i_j, step)
-        ground = _homogeneous(x_i[chosen])
+        ground = homogeneous(x_i[chosen])
         ground = ground * (plane.offset / (ground @ plane.normal))[:, None]
         X_j = (ground - t) @ R
         return ((X_j[:, :2] / X_j[:, 2:]) - x_j[chosen]) / sigma
@@ -341,12 +336,12 @@ def _minimise_sampson(
     sigma = _PIXEL_SIGMA / focal_px
     length = 1.0 if prior is None else float(np.linalg.norm(prior.t_i_j))
     whiten = None if prior is None else np.linalg.cholesky(np.linalg.inv(prior.covariance)).T
-    p_i, p_j = _homogeneous(x_i), _homogeneous(x_j)
+    p_i, p_j = homogeneous(x_i), homogeneous(x_j)
 
     def at(steps: Array) -> Array:
         """Residuals (K, rows) after each of K steps."""
         moved = [_moved(R, t, step) for step in steps]
-        rows = _sampson(p_i, p_j, np.stack([_essential(*one) for one in moved])) / sigma
+        rows = distances(p_i, p_j, np.stack([essential(*one) for one in moved])) / sigma
         other = [others(*one) for one in moved]
         return np.column_stack([rows, np.array(other)])
 
@@ -380,72 +375,3 @@ def _covariance(jacobian: Array, residual: Array) -> Array:
     degrees = max(1, len(residual) - 6)
     variance = max(1.0, float((np.clip(residual, -3, 3) ** 2).sum() / degrees))
     return np.linalg.inv(jacobian.T @ jacobian + np.eye(6)) * variance
-
-
-def sampson(x_i: Array, x_j: Array, R_i_j: Array, t_i_j: Array) -> Array:
-    """Signed Sampson distance (N,) in slopes of matches (N, 2) from the epipolar geometry of a motion."""
-    return _sampson(_homogeneous(x_i), _homogeneous(x_j), _essential(R_i_j, t_i_j))
-
-
-def _essential(R_i_j: Array, t_i_j: Array) -> Array:
-    """E (3, 3) with x_j' E x_i = 0."""
-    t = t_i_j / np.linalg.norm(t_i_j)
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    return (cross @ R_i_j).T
-
-
-def _sampson(p_i: Array, p_j: Array, E: Array) -> Array:
-    """Distances (..., N) for essential matrices (..., 3, 3)."""
-    line_j, line_i = p_i @ E.swapaxes(-1, -2), p_j @ E
-    norm = np.sqrt((line_j[..., :2] ** 2).sum(-1) + (line_i[..., :2] ** 2).sum(-1))
-    return (p_j * line_j).sum(-1) / np.maximum(norm, 1e-12)
-
-
-def depths(x_i: Array, x_j: Array, R_i_j: Array, t_i_j: Array) -> tuple[Array, Array]:
-    """Depths Z (N,), (N,) in both cameras where the rays of each match come closest; nan for parallel rays."""
-    d_i, d_j = _homogeneous(x_i), _homogeneous(x_j) @ R_i_j.T
-    a, b, c = (d_i**2).sum(1), (d_i * d_j).sum(1), (d_j**2).sum(1)
-    e, f = d_i @ t_i_j, d_j @ t_i_j
-    determinant = a * c - b * b
-    safe = np.where(determinant > 1e-12 * a * c, determinant, np.nan)
-    return (c * e - b * f) / safe, (b * e - a * f) / safe
-
-
-class Scale(NamedTuple):
-    """What the laser says of a motion's length: the factor, its relative sigma, and the votes' relative spread."""
-
-    scale: float
-    sigma: float
-    spread: float
-
-
-def laser_scale(views: list[tuple[Array, Array, Array]]) -> Scale:
-    """Scale of a motion from (slopes (N, 2), depths (N,), soundings (L, 3)) of each image.
-
-    The paper takes the one feature nearest to a laser point; here every feature within a small angle of soundings
-    votes with the logarithm of the depth ratio, and the weighted median decides. All nan where there are too few.
-    """
-    logs, weights = [np.zeros(0)], [np.zeros(0)]
-    for x, depth, soundings in views:
-        if len(soundings) and len(x):
-            slopes = soundings[:, :2] / soundings[:, 2:]
-            distance, nearest = KDTree(slopes).query(x, k=min(4, len(slopes)), distance_upper_bound=_SCALE_RADIUS)
-            distance, nearest = distance.reshape(len(x), -1), nearest.reshape(len(x), -1)
-            near = np.isfinite(distance[:, -1]) & (depth > 0)
-            laser_depth = np.median(soundings[nearest[near], 2], axis=1)
-            logs.append(np.log(laser_depth / depth[near]))
-            weights.append(1 / (0.005**2 + (0.3 * distance[near, 0]) ** 2))
-    ratio, weight = np.concatenate(logs), np.concatenate(weights)
-    if len(ratio) < _MIN_SCALE_FEATURES:
-        return Scale(float("nan"), float("nan"), float("nan"))
-    median = _weighted_median(ratio, weight)
-    spread = 1.4826 * _weighted_median(np.abs(ratio - median), weight)
-    effective = weight.sum() ** 2 / (weight**2).sum()
-    sigma = max(spread, 0.002) * 1.2533 / np.sqrt(effective) + 5e-4
-    return Scale(float(np.exp(median)), float(sigma), spread)
-
-
-def _weighted_median(values: Array, weights: Array) -> float:
-    order = np.argsort(values)
-    cumulative = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(cumulative, cumulative[-1] / 2)])

@@ -133,30 +133,6 @@ def test_plane_through_soundings_with_outliers():
     assert motion.fit_plane(X[:5], 0.02) is None
 
 
-def test_scale_is_a_robust_vote_of_the_features_near_soundings():
-    rng = np.random.default_rng(1)
-    soundings = np.column_stack([rng.uniform(-0.9, 0.9, (400, 1)), np.zeros((400, 1)), np.full((400, 1), 3.0)])
-    x = np.column_stack([rng.uniform(-0.3, 0.3, 200), rng.uniform(-0.02, 0.02, 200)])
-    depth = 3.0 / 1.25 * (1 + rng.normal(0, 0.01, 200))
-    depth[:30] *= rng.uniform(0.5, 2, 30)
-    scale, sigma, _ = motion.laser_scale([(x, depth, soundings)])
-    assert abs(scale / 1.25 - 1) < 4 * sigma
-    assert 5e-4 < sigma < 5e-3
-    assert np.isnan(motion.laser_scale([(x + 0.5, depth, soundings)]).scale)
-
-
-def test_sampson_and_depths_of_perfect_matches():
-    points, poses = scenes.seabed(0.3), scenes.cameras([[0, 0, 0], [0.3, 0.8, 0.1]])
-    x_i, x_j = scenes.matches(points, poses, 0, 1, np.random.default_rng(0), noise_px=0, outliers=0)
-    R, t = scenes.true_motion(poses, 0, 1)
-    assert np.abs(motion.sampson(x_i, x_j, R, t)).max() < 1e-12
-    assert np.abs(motion.sampson(x_i, np.add(x_j, [0, 1e-3]), R, t)).mean() > 1e-4
-    depth_i, depth_j = motion.depths(x_i, x_j, R, t)
-    X_i = np.column_stack([x_i, np.ones(len(x_i))]) * depth_i[:, None]
-    X_j = np.column_stack([x_j, np.ones(len(x_j))]) * depth_j[:, None]
-    np.testing.assert_allclose(X_i, X_j @ R.T + t, atol=1e-9)
-
-
 @pytest.mark.parametrize("relief_m", [0.0, 0.3])
 def test_an_error_that_soundings_share_is_an_error_of_the_scale(relief_m):
     points, poses, rng = scenes.seabed(relief_m), scenes.cameras([[0, 0, 0], [0, 0.6, 0]]), np.random.default_rng(3)
