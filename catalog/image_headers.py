@@ -163,4 +163,5 @@ def _exif_time(block: BinaryIO) -> str:
     date, _, time = texts[0].partition(" ")
     if not time:
         return ""
-    return f"{date.replace(':', '-')}T{time}{'.' + texts[1] if texts[1].isdigit() else ''}{texts[2] or 'Z'}"
+    offset = texts[2] if any(map(str.isdigit, texts[2])) else "Z"  # cameras write an unknown one as blanks and a colon
+    return f"{date.replace(':', '-')}T{time}{'.' + texts[1] if texts[1].isdigit() else ''}{offset}"

@@ -17,6 +17,7 @@ _GAP_INTERVALS = 10
 
 _PERIODIC = {"longitude", "roll", "heading"}
 SIGMAS = ("horizontal", "depth", "roll", "pitch", "heading")
+_COLUMNS = {"horizontal": ("latitude", "longitude")}  # of a sigma, where it is not the one of its name
 
 
 # What a vehicle may do in a gap of its navigation: sigma a second from the nearest sample, and at most (m, degrees)
@@ -75,11 +76,14 @@ def at_times(navigation: Navigation, ns: Times, offset_s: float, sigma: Navigati
         column = navigation.sigma.get(name, np.full(len(times), usual))
         values[f"sigma_{name}"] = _interpolate(times, np.where(np.isfinite(column), column, usual), ns, False)
     values = {name: np.where(inside, column, np.nan) for name, column in values.items()}
-    complete = times[_complete(navigation)]
-    in_gap = inside & _in_gap(complete, ns)
+    in_gap = np.zeros(len(ns), bool)
     for name, (rate, most) in _UNSEEN.items():
-        unseen = np.minimum(rate * _to_nearest_s(complete, ns), most) * in_gap
+        columns = [getattr(navigation, column) for column in _COLUMNS.get(name, (name,))]
+        measured = times[np.isfinite(columns).all(0)]
+        gap = inside & _in_gap(measured, ns)
+        unseen = np.minimum(rate * _to_nearest_s(measured, ns), most) * gap
         values[f"sigma_{name}"] = np.hypot(values[f"sigma_{name}"], unseen)
+        in_gap |= gap
     return Poses(values, (first, last), in_gap)
 
 
@@ -90,12 +94,6 @@ def _to_nearest_s(times: Times, at: Times) -> Array:
     after = np.clip(np.searchsorted(times, at), 1, max(1, len(times) - 1))
     nearest = np.minimum(np.abs(at - times[after - 1]), np.abs(times[np.minimum(after, len(times) - 1)] - at))
     return nearest * 1e-9
-
-
-def _complete(navigation: Navigation) -> NDArray[np.bool_]:
-    columns = [navigation.latitude, navigation.longitude, navigation.depth]
-    columns += [navigation.roll, navigation.pitch, navigation.heading]
-    return np.logical_and.reduce(np.isfinite(columns))
 
 
 def span(navigation: Navigation, offset_s: float) -> tuple[int, int]:

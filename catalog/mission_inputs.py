@@ -114,11 +114,22 @@ def _consistency_problems(inputs: MissionInputs, mission: Mission, document: Doc
                 remedy = "Add laser to the calibration, or write role: texture."
                 expected = f"a laser in {mission.calibration}"
                 problems.append(Problem(MISSION, line, key, f"role {image_set.role}, but no laser", expected, remedy))
-    if mission.navigation is None and all(image_set.role == "laser" for image_set in mission.images):
+    if mission.navigation is None:
+        problems += _nothing_to_go_by({image_set.role for image_set in mission.images}, inputs)
+    return problems
+
+
+def _nothing_to_go_by(roles: set[str], inputs: MissionInputs) -> list[Problem]:
+    """What is missing where there is no navigation: then images place each other, and their laser gives the scale."""
+    if roles == {"laser"}:
         remedy = "Add navigation, or images with texture."
         found = "laser images only, and no navigation"
-        problems.append(Problem(MISSION, 1, "navigation", found, "something that places the images", remedy))
-    return problems
+        return [Problem(MISSION, 1, "navigation", found, "something that places the images", remedy)]
+    if "combined" not in roles or (inputs.calibration is not None and not inputs.has_laser):
+        remedy = "Add navigation, or images in which laser and texture are together."
+        found = "no navigation, and no laser in the images with texture"
+        return [Problem(MISSION, 1, "navigation", found, "something that tells the scale", remedy)]
+    return []
 
 
 def input_warnings(inputs: MissionInputs, images: list[str], vertical: str | None) -> list[str]:
@@ -126,11 +137,6 @@ def input_warnings(inputs: MissionInputs, images: list[str], vertical: str | Non
     mission, warnings = inputs.mission, []
     if mission is None:
         return []
-    roles = {image_set.role for image_set in mission.images}
-    if mission.navigation is None and not inputs.has_laser:
-        warnings.append("neither navigation nor laser: the scale of the products is unknown")
-    if mission.navigation is None and roles == {"texture", "laser"}:
-        warnings.append("laser images cannot be placed between their neighbours without navigation")
     if mission.tide is not None and vertical is None:
         warnings.append("a tide is given but no vertical_datum: the products cannot say to what heights refer")
     if inputs.calibration is not None and inputs.calibration.unknown_parameters:

@@ -26,13 +26,13 @@ class Node(NamedTuple):
 
     Attributes
     ----------
-    uri : of its file, in the folder.
+    uri : of its file, in the folder; None for a tile that has nothing but finer ones.
     low, high : (3,) corners of its box from the local origin, m.
     error_m : how far it is from the finest tiles at most.
     children : the tiles of the next finer level that replace it.
     """
 
-    uri: str
+    uri: str | None
     low: Array
     high: Array
     error_m: float
@@ -80,7 +80,7 @@ def _tile(node: Node) -> dict[str, Any]:
         "boundingVolume": {"box": _box(node.low, node.high)},
         # a tile without finer ones is never refined
         "geometricError": node.error_m if children else 0.0,
-        "content": {"uri": node.uri},
+        **({"content": {"uri": node.uri}} if node.uri else {}),
         **({"children": children} if children else {}),
     }
 

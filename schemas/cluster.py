@@ -53,4 +53,6 @@ class Cluster(Model):
             for name in _OF_JOBS:
                 if getattr(self, name):
                     raise inconsistent(name, "a value", "none for kind: local", "Remove it, or correct kind.")
+            if self.cores != 1:
+                raise inconsistent("cores", str(self.cores), "none for kind: local", "Write workers instead.")
         return self

@@ -29,6 +29,8 @@ VERSION_NAMES: Final = (
     "warnings",
 )
 
+_TEXTS: Final = ("id", "title", "platform", "start", "end", "created")
+
 Row = Mapping[str, Any]
 
 _DATE: Final = re.compile(r"(\"[^\"]*\"|'[^']*')|\b(\d{4}-\d\d(?:-\d\d(?:T[\d:.]+Z?)?)?)(?![\w-])")
@@ -101,6 +103,8 @@ def _fault(node: ast.AST, names: tuple[str, ...]) -> str:
         return "" if isinstance(node.value, str | int | float | None) else f"the value {node.value!r}"
     if isinstance(node, ast.Compare) and all(type(sign) in _COMPARE for sign in node.ops):
         below: list[ast.expr] = [node.left, *node.comparators]
+        if any(isinstance(one, ast.Name) and one.id in _TEXTS for one in below) and any(map(_is_number, below)):
+            return f"{ast.unparse(node)}, a text beside a number (a date is 2026-06, a text is in quotes)"
     elif isinstance(node, ast.BoolOp):
         below = node.values
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
@@ -114,6 +118,10 @@ def _fault(node: ast.AST, names: tuple[str, ...]) -> str:
     else:
         return f"{ast.unparse(node)}, which is no comparison"
     return next(filter(None, (_fault(one, names) for one in below)), "")
+
+
+def _is_number(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, int | float)
 
 
 def _is_negative(node: ast.UnaryOp) -> bool:

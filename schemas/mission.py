@@ -70,7 +70,7 @@ class NavigationSource(Model):
     """Where the navigation is and how good it is."""
 
     path: RelativePath
-    time_offset: Annotated[float, Field(ge=-1e6, le=1e6, description="seconds added to navigation times")] = 0.0
+    time_offset: Annotated[float, Field(ge=-4e9, le=4e9, description="seconds added to navigation times")] = 0.0
     sigma: NavigationSigma = NavigationSigma()
 
 

@@ -11,13 +11,13 @@ from .problems import InvalidInput, Problem, on_lines
 _DEGREES = Bounds(-180, 180, "degrees")
 _COLUMNS = {
     "latitude": Bounds(-90, 90, "degrees", "Write decimal degrees; check that latitude and longitude are not swapped."),
-    "longitude": Bounds(-180, 180, "degrees", "Write decimal degrees, west negative."),
+    "longitude": Bounds(-360, 360, "degrees", "Write decimal degrees, west negative."),
     # Negative depths are above the surface: the format also serves drones.
     "depth": Bounds(-10_000, 12_000, "metres below the sea surface"),
     "altitude": Bounds(0, 12_000, "metres above the seabed", "Leave the cell empty where there was no bottom return."),
     "roll": _DEGREES,
     "pitch": Bounds(-90, 90, "degrees"),
-    "heading": Bounds(-360, 360, "degrees from true north"),
+    "heading": Bounds(-1e5, 1e5, "degrees from true north"),  # some count their turns
 }
 _POSITIVE = "Write a 1-sigma above zero, or leave the cell empty to use the one of mission.yaml."
 _METRES = Bounds(1e-4, 1e5, "metres", _POSITIVE)

@@ -84,12 +84,18 @@ class Adjusted(NamedTuple):
 
 
 def adjust(
-    count: int, links: list[Link], navigation: NavigationPrior | None, R_first: Array, p: AdjustParameters
+    count: int,
+    links: list[Link],
+    navigation: NavigationPrior | None,
+    R_first: Array,
+    p: AdjustParameters,
+    first: int = 0,
 ) -> Adjusted:
     """Estimate the poses of `count` images in order of time.
 
     links must be metric where there is no navigation; with navigation those that are not are scaled by it.
-    R_first : R_local_camera (3, 3) of the first image, used without navigation only.
+    R_first : R_local_camera (3, 3) of the first image, and first its number where nothing is linked; used without
+        navigation only.
     """
     turned = _half_turns(count, links)
     if navigation is not None:
@@ -98,10 +104,10 @@ def adjust(
     plausible = np.array([_plausible(link, navigation) for link in links], bool)
     usable = [link for link, ok in zip(links, plausible, strict=True) if ok]
     # once with all, then without the links that contradict the rest
-    start, graph = _start(count, usable, navigation, R_first)
+    start, graph = _start(count, usable, navigation, R_first, first)
     values = _solve(graph, _within(usable, start), start, p.robust_threshold)
     usable = [link for link in _within(usable, start) if _agrees(link, values)]
-    start, graph = _start(count, usable, navigation, R_first)
+    start, graph = _start(count, usable, navigation, R_first, first)
     usable = _within(usable, start)
     values = _solve(graph, usable, start, p.robust_threshold)
     kept = {(link.i, link.j) for link in usable}
@@ -153,11 +159,13 @@ def _plausible(link: Link, navigation: NavigationPrior | None) -> bool:
     return link.free or (link.motion.metric if navigation is None else _agrees_with_navigation(link, navigation))
 
 
-def _start(count: int, links: list[Link], navigation: NavigationPrior | None, R_first: Array) -> tuple[Poses, Any]:
+def _start(
+    count: int, links: list[Link], navigation: NavigationPrior | None, R_first: Array, first: int
+) -> tuple[Poses, Any]:
     """First values of all poses that can have one, and the factors that tie them to the ground."""
     if navigation is not None:
         return navigation.poses, navigation_factors(navigation)
-    start = _chain(count, links, R_first)
+    start = _chain(count, links, R_first, first)
     return start, datum(start, int(np.flatnonzero(start.known)[0]))
 
 
@@ -166,11 +174,11 @@ def _within(links: list[Link], start: Poses) -> list[Link]:
     return [link for link in links if known[link.i] and known[link.j]]
 
 
-def _chain(count: int, links: list[Link], R_first: Array) -> Poses:
+def _chain(count: int, links: list[Link], R_first: Array, first: int) -> Poses:
     """Motions chained outwards from the first linked image along the links with most matches (paper IV)."""
     R, C = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
     if not links:
-        R[0], C[0] = R_first, 0.0
+        R[first], C[first] = R_first, 0.0
         return Poses(R, C)
     i, j = np.array([[link.i, link.j] for link in links]).T
     weight = np.array([1.0 / len(link.motion.inliers) for link in links])

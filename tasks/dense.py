@@ -31,7 +31,7 @@ _LEAST_CONTRAST = 1.5  # grey levels, standard deviation of what counts as textu
 _DARK, _BRIGHT = 2, 250
 _SPECKLE_PX, _SPECKLE_STEP = 120, 2  # smaller islands of disparity go; an island ends where disparity jumps by so much
 _RIM_PX = 2  # beside what could not be matched
-_EVERY = 2  # rectified pixels from point to point: neighbours tell the same
+_ENOUGH_PX = 5.0  # rectified pixels across a cell, of which every second one each way says enough
 
 
 class Rectified(NamedTuple):
@@ -235,11 +235,16 @@ def disparity(made: Rectified, first: tuple[Pixels, Mask], second: tuple[Pixels,
     return np.where(good, found, np.float32(np.nan))
 
 
-def points(made: Rectified, matched: Refined, first: Sight, second: Sight) -> Relief:
-    """The points of a disparity image, by the exact rays of both cameras."""
+def spacing(pixels_a_cell: float) -> int:
+    """Rectified pixels from point to point: neighbours tell the same, but a cell needs some."""
+    return 2 if pixels_a_cell >= _ENOUGH_PX else 1
+
+
+def points(made: Rectified, matched: Refined, first: Sight, second: Sight, every: int = 1) -> Relief:
+    """The points of a disparity image, by the exact rays of both cameras. every : by `spacing`."""
     found = matched.disparity
-    row, column = np.nonzero(np.isfinite(found[::_EVERY, ::_EVERY]))
-    row, column = row * _EVERY, column * _EVERY
+    row, column = np.nonzero(np.isfinite(found[::every, ::every]))
+    row, column = row * every, column * every
     moved = column - found[row, column].astype(float)
     x_i, y_i = _slopes(made, column, row, False)
     x_j, _ = _slopes(made, moved, row, True)

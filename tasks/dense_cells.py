@@ -11,7 +11,7 @@ from .gridding import group_index, group_median
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]
 
-_LEAST_POINTS = 3  # of a cell
+_LEAST_POINTS = 3  # of a cell; half of what it could have where that is less
 _NEIGHBOURS = 8
 _STEEPEST = 1.0  # rise over run from the points known to a cell among them
 _NEAR_PX = 2.0
@@ -42,13 +42,18 @@ class PairCells(NamedTuple):
 NO_CELLS = PairCells(np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool), np.zeros(0))
 
 
-def reduce_to_cells(X_map: Array, metres_per_px: Array, noise_px: Array, known_map: Array, cell_m: float) -> PairCells:
-    """Cells of the points (N, 3) of a pair, map coordinates; known_map : (K, 3) laser and tie points around."""
+def reduce_to_cells(
+    X_map: Array, metres_per_px: Array, noise_px: Array, known_map: Array, cell_m: float, points_a_cell: float = np.inf
+) -> PairCells:
+    """Cells of the points (N, 3) of a pair, map coordinates.
+
+    known_map : (K, 3) laser and tie points around. points_a_cell : that a cell can have.
+    """
     key = np.floor(X_map[:, :2] / cell_m).astype(np.int64)
     order = np.lexsort((X_map[:, 2], key[:, 0], key[:, 1]))
     group = group_index(key[order])
     count = np.bincount(group)
-    enough = count >= _LEAST_POINTS
+    enough = count >= min(_LEAST_POINTS, points_a_cell / 2)
     order, group = order[enough[group]], group_index(group[enough[group]])
     if not len(order):
         return NO_CELLS
@@ -135,12 +140,17 @@ def _means(X: Array, cell_m: float) -> Array:
     return np.column_stack([np.bincount(group, column) for column in X.T]) / np.bincount(group)[:, None]
 
 
+def tell(off: Array) -> bool:
+    """Whether differences (K,) are enough to say something."""
+    return len(off) >= _LEAST_COMPARED
+
+
 def share_of_each(off: Array, otherwise: float) -> float:
     """1-sigma of either side of differences (K,): two thirds of them are within it, times the root of two.
 
     The poses of the laser's image and those of the pair are held by the same tie points, so either has half of the
     variance. Too few differences say nothing.
     """
-    if len(off) < _LEAST_COMPARED:
+    if not tell(off):
         return otherwise
     return float(np.quantile(np.abs(off), _ONE_SIGMA) / np.sqrt(2))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pyproj
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .rotations import nearest_rotation
 
@@ -60,6 +60,10 @@ class MapFrame:
         """Local points (N, 3) of geographic positions (N,) in degrees and elevations in metres."""
         return np.column_stack(self._local_from_geographic.transform(longitude, latitude, elevation))
 
+    def R_local_enu(self, longitude: Array, latitude: Array) -> Array:
+        """Rotations (..., 3, 3) from east, north, up at geographic positions (...), degrees, to local axes."""
+        return _R_geocentric_enu(self.longitude, self.latitude).T @ _R_geocentric_enu(longitude, latitude)
+
     def geographic_from_local(self, X_local: Array) -> Array:
         """Longitude, latitude (degrees) and elevation (metres), (N, 3), of local points (N, 3)."""
         return np.column_stack(self._local_from_geographic.transform(*np.asarray(X_local).T, direction="INVERSE"))
@@ -99,3 +103,12 @@ class MapFrame:
     def R_map_local(self, X_map: Array) -> Array:
         """Rotations (..., 3, 3) from local to map axes at map points (..., 3): the meridian convergence, mostly."""
         return nearest_rotation(self.affine_at(X_map).matrix.swapaxes(-1, -2))
+
+
+def _R_geocentric_enu(longitude: ArrayLike, latitude: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) from east, north, up at geographic positions (...), degrees, to geocentric axes."""
+    across, up = np.radians(longitude), np.radians(latitude)
+    (sin_l, cos_l), (sin_p, cos_p), zero = (np.sin(across), np.cos(across)), (np.sin(up), np.cos(up)), 0 * across
+    east, north = (-sin_l, cos_l, zero), (-sin_p * cos_l, -sin_p * sin_l, cos_p)
+    axes = [np.stack(axis, -1) for axis in (east, north, (cos_p * cos_l, cos_p * sin_l, sin_p))]
+    return np.stack(axes, -1)

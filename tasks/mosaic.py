@@ -210,7 +210,7 @@ def _share_out(
     seen_at_all = np.isfinite(lowest)
     weights = [cv2.exp((np.where(seen_at_all, lowest, 0) - cost) / np.float32(feather_m)) for cost in costs]
     scale = np.float32(_WEIGHTS) / np.maximum(sum(weights), np.float32(1))
-    shares = [np.rint(weight * scale).astype(np.int16) for weight in weights]
+    shares = [np.floor(weight * scale).astype(np.int16) for weight in weights]  # never more than there is
     rest = np.where(seen_at_all, _WEIGHTS - sum(shares), 0)
     for place_in_line, (k, share, cost) in enumerate(zip(rivals, shares, costs, strict=True)):
         share = share + np.where(first == place_in_line, rest, 0)

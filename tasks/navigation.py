@@ -45,13 +45,10 @@ class VehicleState(NamedTuple):
 
 
 def camera_poses(state: VehicleState, mount: Mount, frame: MapFrame) -> Poses:
-    """Poses of the camera by navigation alone.
-
-    The level frame of each position is parallel to the local frame's: over one kilometre true north turns by less
-    than 0.01 degree, a tenth of the best heading sensor's error.
-    """
+    """Poses of the camera by navigation alone; level is at the vehicle, not at the mission's origin."""
     vehicle = frame.local_from_geographic(state.longitude, state.latitude, state.elevation)
-    R_local_vehicle = R_LOCAL_LEVEL @ R_level_vehicle(state.roll, state.pitch, state.heading)
+    R_local_level = frame.R_local_enu(state.longitude, state.latitude) @ R_LOCAL_LEVEL
+    R_local_vehicle = R_local_level @ R_level_vehicle(state.roll, state.pitch, state.heading)
     lever_arm = R_local_vehicle @ np.asarray(mount.translation)
     return Poses(R_local_vehicle @ R_vehicle_camera(*mount.rotation), vehicle + lever_arm)
 

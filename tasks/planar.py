@@ -20,6 +20,7 @@ Indices = NDArray[np.integer]
 _ROUNDS: Final = 6
 _HUBER_SIGMAS: Final = 1.5
 _MAD_TO_SIGMA: Final = 1.4826
+_LEAST_DOWN: Final = 0.1  # of a ray of about unit length
 
 
 class Matches(NamedTuple):
@@ -40,15 +41,11 @@ class Matches(NamedTuple):
 def level_slopes(R_local_camera: Array, slopes: Array) -> Array:
     """Slopes (N, 2) east and north per metre down of slopes (N, 2) X/Z, Y/Z in the camera frame.
 
-    Raises
-    ------
-    ValueError
-        A ray does not point down.
+    NaN where a ray points hardly down or up: it meets the plane of the seabed far away or nowhere.
     """
     rays = np.column_stack([slopes, np.ones(len(slopes))]) @ R_local_camera.T
-    if (rays[:, 2] >= 0).any():
-        raise ValueError("a ray of the image points above the horizon: it meets no plane of the seabed")
-    return rays[:, :2] / -rays[:, 2:]
+    down = np.where(rays[:, 2:] < -_LEAST_DOWN, -rays[:, 2:], np.nan)
+    return rays[:, :2] / down
 
 
 def prior(C_map: Array, altitude_m: Array, R_map_local: Array) -> Array:

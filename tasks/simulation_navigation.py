@@ -178,7 +178,7 @@ def cameras(states: States, mount: Mount) -> Cameras:
 
 def sample_times(plan: Plan, rate_hz: float) -> Array:
     """Times of navigation samples, seconds: from the start to a lead after the last image."""
-    return np.arange(0, plan.image_time_s[-1] + LEAD_S, 1 / rate_hz)
+    return np.arange(0, plan.image_time_s[-1] + LEAD_S + 1 / rate_hz, 1 / rate_hz)
 
 
 def measured(true: States, scene: NavigationScene, rng: np.random.Generator) -> States:

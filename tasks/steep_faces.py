@@ -167,7 +167,7 @@ def _connected(triangles: Faces) -> list[Faces]:
     a, b = face[order][:-1][same], face[order][1:][same]
     joined = sparse.coo_matrix((np.ones(len(a)), (a, b)), (len(triangles),) * 2)
     _, group = sparse.csgraph.connected_components(joined, directed=False)
-    return [np.flatnonzero(group == k) for k in range(group.max() + 1)]
+    return np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
 
 
 def _shared_out(area: Array) -> list[tuple[int, Faces]]:

@@ -165,7 +165,7 @@ def reprocess(
     from .progress import log_to_stderr
 
     log_to_stderr(verbose, log_json, bars=False)
-    chosen = options.cluster(cluster, scheduler)
+    chosen = options.cluster(cluster, scheduler, workers)
     states = [state for state in _selected(archive, where) if state.look is not None]
     if not states:
         remedy = "Look at `seamosaic status` for what there is."

@@ -85,10 +85,10 @@ def run_board(folder: Path, out: Path, setup: BoardSetup, parameters: Parameters
     free = () if setup.hold_camera else _free(camera.model, len(seen.names))
     found = adjusting.calibrate_board(_data(seen), camera, free, setup.bent)
     result = _calibration(found, setup, free)
-    written = calibrate.write(out, result, _page(folder, seen, setup, found, free, result))
-    if result.laser is None and len(found.sheets):
-        _write_planes(out / PLANES, found)
-    return written
+    page = _page(folder, seen, setup, found, free, result)
+    if result.laser is None and len(found.sheets):  # first: with calibration.yaml the folder is finished
+        _write_planes(out, found)
+    return calibrate.write(out, result, page)
 
 
 def _free(model: starting.Model, images: int) -> tuple[str, ...]:
@@ -244,7 +244,7 @@ def _facing(sheet: Array, normal: Array) -> Array:
     return sheet if sheet[:3] @ normal >= 0 else -sheet
 
 
-def _write_planes(path: Path, found: adjusting.BoardResult) -> None:
+def _write_planes(out: Path, found: adjusting.BoardResult) -> None:
     """Sheets that calibration.yaml has no place for: normal . X = offset, camera frame, metres, with covariances."""
     planes = [
         {
@@ -255,7 +255,9 @@ def _write_planes(path: Path, found: adjusting.BoardResult) -> None:
         }
         for s, sheet in enumerate(found.sheets)
     ]
-    path.write_text(yaml.safe_dump({"planes": planes}, sort_keys=False, default_flow_style=None, width=120))
+    out.mkdir(parents=True, exist_ok=True)
+    text = yaml.safe_dump({"planes": planes}, sort_keys=False, default_flow_style=None, width=120)
+    (out / PLANES).write_text(text, encoding="utf-8")
 
 
 def _sheet_covariance(found: adjusting.BoardResult, sheet: int) -> Array:

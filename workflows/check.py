@@ -20,7 +20,7 @@ from ..tasks.grids import bathymetry_cell_m, mosaic_cell_m
 from ..tasks.navigation import VehicleState, camera_poses
 from ..tasks.pairs import footprints
 from ..tasks.rings import rings
-from . import memory_need
+from . import memory_need, plan
 from .results import vertical_reference
 
 
@@ -80,7 +80,10 @@ def check(url: str, parameters: Parameters) -> CheckResult:
             )
         except InvalidInput as invalid:
             return CheckResult(url, opened, invalid.problems, tuple(opened.warnings), ())
-    return CheckResult(url, opened, (), tuple(opened.warnings), tuple(_plan(opened, parameters, seen)))
+    warnings = list(opened.warnings)
+    if seen is not None and opened.calibration.laser is not None:
+        warnings += filter(None, [plan.beyond_the_laser(parameters, seen.altitude_m)])
+    return CheckResult(url, opened, (), tuple(warnings), tuple(_plan(opened, parameters, seen)))
 
 
 def coverage(opened: OpenedMission) -> Coverage | None:

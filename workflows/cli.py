@@ -76,7 +76,7 @@ def run(
     from . import run as runner
 
     log_to_stderr(verbose, log_json)
-    chosen = options.cluster(cluster, scheduler)
+    chosen = options.cluster(cluster, scheduler, workers)
     if is_archive(mission):
         _refuse_beside_an_archive(out, params, set_)
         archive_commands.run(mission, archive_commands.Running(scheduler, workers, chosen, as_json, log_json, verbose))

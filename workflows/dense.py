@@ -22,6 +22,7 @@ _DEPTH_SHARE = 0.005  # of what is known of the depth is left out at either end
 _DEPTH_MARGIN = 0.08  # of the depth
 _IMAGES_KEPT = 4
 _WITHIN_CELLS = 0.5
+_WINDOW_CELLS = 1.8  # across a window of matching: that much sharing is in the noise as it is stated
 # where no laser tells: half a pixel of dense matching, which is on smaller images, and one of tie points
 _DENSE_PX, _TIE_PX, UNKNOWN_M = 0.5, 1.0, 1.0
 
@@ -104,13 +105,18 @@ def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
     pixels = [view(image) for image in (pair.i, pair.j)]
     warped = [dense.warp(made, seen, *of, scale) for seen, of in zip(sights, pixels, strict=True)]
     found = dense_refine.refine(dense.disparity(made, *warped), *warped)
-    relief = dense.points(made, found, *sights)
+    pixels_a_cell = m.cell_m * made.focal_px / float(np.median(depth))
+    every = dense.spacing(pixels_a_cell)
+    relief = dense.points(made, found, *sights, every)
+    # cells in one window share its noise, and what smooths them takes them for independent
+    noise_px = relief.noise_px * max(1.0, dense_refine.WINDOW_PX / pixels_a_cell / _WINDOW_CELLS)
 
     def to_map(X_local: np.ndarray) -> np.ndarray:
         return m.frame.map_around(X_local, poses.C_local[i])
 
+    expected = (pixels_a_cell / every) ** 2
     cells = dense_cells.reduce_to_cells(
-        to_map(relief.X_local), relief.metres_per_px, relief.noise_px, to_map(known), m.cell_m
+        to_map(relief.X_local), relief.metres_per_px, noise_px, to_map(known), m.cell_m, expected
     )
     return Made(cells._asdict(), {"cells": len(cells.X_map)})
 
@@ -162,7 +168,7 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
         found = {
             "dense_px": dense_cells.share_of_each(dense_px, _DENSE_PX),
             "tie_px": dense_cells.share_of_each(tie_px, _TIE_PX),
-            "laser_m": dense_cells.share_of_each(dense_m if len(dense_m) else tie_m, UNKNOWN_M),
+            "laser_m": dense_cells.share_of_each(dense_m if dense_cells.tell(dense_m) else tie_m, UNKNOWN_M),
         }
         return Made({}, {name: round(value, 4) for name, value in found.items()})
 

@@ -1,6 +1,6 @@
 """From poses to maps: which images and pairs touch which tile, and the graphs over the tiles."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from dask.delayed import Delayed, delayed
@@ -32,10 +32,10 @@ class NothingToMap(RuntimeError):
 def map_tiles(state: Session, posed: Posed) -> Mapped:
     """Tiles: cells, surface, mosaics."""
     job, p = state.job, state.job.parameters
-    ranges = np.array([range_of(posed.extracted.get(k), state.plan.range_m[k]) for k in range(len(state.plan.range_m))])
+    ranges = heights(state, posed.extracted)
     images = _images(state, posed, ranges)
     if not images:
-        raise NothingToMap("no image has a pose: there is nothing to map")
+        raise NothingToMap("no image has a pose: that takes navigation, or images that overlap and have a laser")
     typical = float(np.median(ranges[[image.row for image in images]]))
     gsd = cameras.ground_sample_distance(job.calibration.camera, typical)
     cell = grids.bathymetry_cell_m(gsd) if p.grid.cell_m == "auto" else float(p.grid.cell_m)
@@ -95,7 +95,7 @@ class _Footprints:
     """Images, found by where their footprints touch the map, grown by a margin for relief and each by moved_m (n,)."""
 
     def __init__(self, outlines: np.ndarray, images: Sequence[Image], moved_m: Sequence[float] = ()):
-        corners, margin_m = outlines[[image.row for image in images]], _margin(outlines, images)
+        corners, margin_m = outlines[[image.row for image in images]], _margins(outlines, images)[:, None]
         if len(moved_m):
             margin_m = margin_m + np.asarray(moved_m)[:, None]
         self._images, self._low, self._high = images, corners.min(1) - margin_m, corners.max(1) + margin_m
@@ -121,10 +121,11 @@ class _Placed:
         return [self._tiles[k] for k in np.flatnonzero(shared).tolist()]
 
 
-def _margin(outlines: np.ndarray, images: Sequence[Image]) -> float:
-    """What relief may add to a footprint on level ground: a share of its size, metres."""
+def _margins(outlines: np.ndarray, images: Sequence[Image]) -> np.ndarray:
+    """What relief may add to the footprints (n,) on level ground: a share of their size, or the usual one, metres."""
     corners = outlines[[image.row for image in images]]
-    return _RELIEF_SHARE * float(np.median(corners.max(1) - corners.min(1))) if len(corners) else 0.0
+    size = (corners.max(1) - corners.min(1)).mean(1)
+    return _RELIEF_SHARE * np.maximum(size, np.median(size) if len(size) else 0)
 
 
 def _bounds(outlines: np.ndarray, images: Sequence[Image]) -> grids.Bounds:
@@ -232,37 +233,41 @@ def _surface(
     steps = (maps.CELLS, maps.GROWTH, maps.SURFACE)
     for step in steps:
         state.ledger.begin(step)
+    footprints, pairs_of = _Footprints(outlines, images), _Pairs(linked)
     tiles = list(grids.tiles(grid, size))
-    footprints = _Footprints(outlines, images)
-    touching, pairs_of = [footprints.touching(tile) for tile in tiles], _Pairs(linked)
-    cell_tasks = [
-        delayed(maps.cells_tile)(
-            m, Tile(tile, seen, pairs_of.images(seen)), agreed, dask_key_name=state.key(f"cells-{m.cell_m:g}", k)
-        )
-        for k, (tile, seen) in enumerate(zip(tiles, touching, strict=True))
-    ]
+    seen = [(tile, touching) for tile in tiles if (touching := footprints.touching(tile))]
+    cell_tasks = []
+    for k, (tile, touching) in enumerate(seen):
+        described = Tile(tile, touching, pairs_of.images(touching))
+        name = state.key(f"cells-{m.cell_m:g}", k)
+        cell_tasks.append(delayed(maps.cells_tile)(m, described, agreed, dask_key_name=name))
     cells: list[Done] = compute(state, maps.CELLS, cell_tasks)
     if not any(done.info["sounded"] for done in cells):
         raise NothingToMap(
             "no image gave a laser sounding, and no two images could be linked (without navigation only the laser "
-            "gives links their scale): there is nothing to map"
+            "gives links their scale): there is nothing to map. Look whether images overlap, and at the laser in "
+            "calibration.yaml and in the parameters"
         )
     halo = maps.surface.halo_cells(m.max_interpolation_m, m.cell_m)
-    placed = _Placed(list(zip(tiles, cells, strict=True)))
-    around = [placed.overlapping(grids.pad(tile, halo)) for tile in tiles]
-    count = max(1, _GROWTH_CELLS // (size * size))
-    order = sorted(range(len(tiles)), key=lambda k: -cells[k].info["sounded"])[:count]
-    samples = [maps.Sample(tiles[k], around[k], outlines[[image.row for image in touching[k]]]) for k in sorted(order)]
+    sounded = [(*one, done) for one, done in zip(seen, cells, strict=True) if done.info["sounded"]]
+    placed = _Placed([(tile, done) for tile, _, done in sounded])
+    every = -(-len(sounded) // max(1, _GROWTH_CELLS // (size * size)))
+    samples = [
+        maps.Sample(tile, placed.overlapping(grids.pad(tile, halo)), outlines[[image.row for image in touching]])
+        for tile, touching, _ in sounded[::every]
+    ]
     task = delayed(maps.fit_growth)(m, samples, dask_key_name=state.key(f"growth-{m.cell_m:g}"))
     (growth,) = compute(state, maps.GROWTH, [task])
+    around = [(tile, placed.overlapping(grids.pad(tile, halo))) for tile in tiles]
+    around = [(tile, near) for tile, near in around if near]  # no others get a value
     surface_tasks = [
         delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=state.key(f"surface-{m.cell_m:g}", k))
-        for k, (tile, near) in enumerate(zip(tiles, around, strict=True))
+        for k, (tile, near) in enumerate(around)
     ]
     surfaces: list[Done] = compute(state, maps.SURFACE, surface_tasks)
     for step, done in zip(steps, (cells, [growth], surfaces), strict=True):
         state.ledger.end(step, done)
-    return Tiles(grid, tuple(zip(tiles, surfaces, strict=True)))
+    return Tiles(grid, tuple((tile, done) for (tile, _), done in zip(around, surfaces, strict=True)))
 
 
 def _layers(state: Session, m: MapJob, surface: Tiles) -> TerrainLayers:
@@ -322,14 +327,17 @@ def _mosaics(
     (aligned,) = compute(
         state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name=state.key("align"))]
     )
-    tiles = list(grids.tiles(grid, state.job.parameters.mosaic.tile_cells))
-    footprints, placed, tasks = _Footprints(outlines, shown, aligned.info["moved_m"]), _Placed(ground.tiles), []
+    footprints, placed = _Footprints(outlines, shown, aligned.info["moved_m"]), _Placed(ground.tiles)
+    tiles = [tile for tile in grids.tiles(grid, state.job.parameters.mosaic.tile_cells) if footprints.touching(tile)]
+    tasks = []
     for k, tile in enumerate(tiles):
         described = Tile(tile, footprints.touching(tile))
         around = maps.ground_around(tile, ground.grid.cell_m, m.max_interpolation_m)
         near = placed.overlapping(around)
         tasks.append(
-            delayed(mosaics.mosaic_tile)(m, described, near, aligned, light, dask_key_name=state.key("mosaic", k))
+            delayed(mosaics.mosaic_tile)(
+                m, described, near, aligned._replace(info={}), light, dask_key_name=state.key("mosaic", k)
+            )
         )
     done: list[Done] = compute(state, mosaics.MOSAIC, tasks)
     for step, results in ((mosaics.ALIGN, [aligned]), (mosaics.MOSAIC, done)):
@@ -350,18 +358,22 @@ def _mesh(
     state.ledger.begin(meshing.MESH)
     footprints, cell = _Footprints(outlines, images), mosaic.grid.cell_m
     grounds, pictured = _Placed(ground.tiles), _Placed(mosaic.tiles)
-    finest, *coarser = meshing.levels(list(meshing.leaves(ground.grid)))
+    found = {place: meshing.leaf_inputs(m, place, cell) for place in meshing.leaves(ground.grid)}
+    near = {place: grounds.overlapping(around) for place, (_, around, _) in found.items()}
+    finest, *coarser = meshing.levels([place for place in found if near[place]])
     tasks: dict[meshing.Place, Delayed] = {}
     for place in finest:
-        own, around, texture = meshing.leaf_inputs(m, place, cell)
-        near, pictures = grounds.overlapping(around), pictured.overlapping(texture)
-        shown = footprints.touching(own)
-        given = (m, place, shown, near, pictures, light, cell)
+        own, _, texture = found[place]
+        shown, pictures = footprints.touching(own), pictured.overlapping(texture)
+        given = (m, place, shown, near[place], pictures, light, cell)
         tasks[place] = delayed(meshing.leaf)(*given, dask_key_name=state.key(f"mesh-{'-'.join(map(str, place))}"))
     below = finest
     for level in coarser:
+        children_of: dict[meshing.Place, list[tuple[meshing.Place, Delayed]]] = {}
+        for child in below:
+            children_of.setdefault(child.parent, []).append((child, tasks[child]))
         for place in level:
-            children = [(child, tasks[child]) for child in below if child.parent == place]
+            children = children_of[place]
             name = state.key(f"mesh-{'-'.join(map(str, place))}")
             tasks[place] = delayed(meshing.parent)(m, place, children, dask_key_name=name)
         below = level
@@ -370,7 +382,14 @@ def _mesh(
     return dict(zip(tasks, made, strict=True))
 
 
-def range_of(done: Done | None, fallback: float) -> float:
-    """Height of a camera above the seabed by its laser, or else by what is known otherwise, metres."""
-    value = done.info.get("range_m") if done else None
-    return float(value) if value else float(fallback)
+def heights(state: Session, extracted: Mapping[int, Done]) -> np.ndarray:
+    """Heights (n,) of all cameras above the seabed by their lasers, metres, or by the altimeter; where there is no
+    altimeter, by the lasers of the images before and after."""
+    count, altitude = len(state.plan.range_m), state.opened.frames["altitude"].values
+    told = np.full(count, np.nan)
+    for row, done in extracted.items():
+        told[row] = done.info.get("range_m") or np.nan
+    lit = np.flatnonzero(np.isfinite(told))
+    by_others = len(lit) and not np.isfinite(altitude).any()
+    otherwise = np.interp(np.arange(count), lit, told[lit]) if by_others else state.plan.range_m
+    return np.where(np.isfinite(told), told, otherwise)

@@ -35,11 +35,11 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
 
     def make() -> Made:
         count = len(solution.sigma_m)
-        parts = [_laser(m, image, solution) for image in tile.images]
+        parts = [_within(tile.grid, _laser(m, image, solution)) for image in tile.images]
         for pair in tile.pairs:
-            parts.append(_matched(m, pair, solution, agreed.info["tie_px"]))
+            parts.append(_within(tile.grid, _matched(m, pair, solution, agreed.info["tie_px"])))
             if pair.dense:
-                parts.append(_dense(m, pair, count, agreed.info["dense_px"]))
+                parts.append(_within(tile.grid, _dense(m, pair, count, agreed.info["dense_px"])))
         soundings = Soundings._make(np.concatenate(column) for column in zip(_NOTHING, *parts, strict=True))
         cells = gridding.grid_soundings(tile.grid, soundings)
         cells = cells._replace(sigma=np.hypot(cells.sigma, np.sqrt(_BEND) * said[-1]))
@@ -90,13 +90,20 @@ def _soundings(X_map: np.ndarray, sigma: np.ndarray, source: int, frame: int, sh
     )
 
 
+def _within(grid: Grid, soundings: Soundings) -> Soundings:
+    """Those in a tile: what many images and pairs have elsewhere need not be held."""
+    there = grids.inside(grid, *grids.index_of(grid, soundings.X))
+    return Soundings._make(values[there] for values in soundings)
+
+
 _NOTHING = _soundings(np.zeros((0, 3)), np.zeros(0), MATCHING, 0, np.zeros(0))
 
 
 def _laser(m: MapJob, image: Image, solution: Solution) -> Soundings:
     arrays = load(m.job, extract.STEP, image.key, ("laser_X", "laser_sigma")).arrays
     X_camera = arrays.get("laser_X", np.zeros((0, 3)))
-    lean = np.hypot(X_camera[:, 0], X_camera[:, 1]) * solution.sigma_tilt_rad[image.row]
+    aside = X_camera @ solution.poses.R_local_camera[image.row].T
+    lean = np.hypot(aside[:, 0], aside[:, 1]) * solution.sigma_tilt_rad[image.row]
     shared = np.hypot(solution.sigma_m[image.row, 2], lean)
     X = m.frame.map_around(dense.sounded(m, image, solution), solution.poses.C_local[image.row])
     return _soundings(X, arrays.get("laser_sigma", np.zeros(0)), LASER, image.row, shared)
@@ -133,14 +140,16 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
     """
 
     def make() -> Made:
-        halos = [_halo(m, sample.tile) for sample in samples]
-        cells = [_cells(m.job, halo, sample.neighbours) for halo, sample in zip(halos, samples, strict=True)]
         reach = m.max_interpolation_m
-        held = [surface.hold_out(h, c, reach, s.tile) for s, h, c in zip(samples, halos, cells, strict=True)]
+        held = []
+        for sample in samples:  # twice over all of them, so that one is held at a time
+            halo = _halo(m, sample.tile)
+            held.append(surface.hold_out(halo, _cells(m.job, halo, sample.neighbours), reach, sample.tile))
         law = surface.fit_growth(surface.Holdout(*(np.concatenate(column) for column in zip(*held, strict=True))))
         sigma = [np.zeros(0)]
-        for sample, halo, known in zip(samples, halos, cells, strict=True):
-            inner = grids.window(halo, sample.tile)
+        for sample in samples:
+            halo = _halo(m, sample.tile)
+            known, inner = _cells(m.job, halo, sample.neighbours), grids.window(halo, sample.tile)
             found = surface.delaunay_surface(halo, known, m.max_interpolation_m, law, sample.tile)
             seen = surface.seen(sample.tile, sample.outlines)
             sigma.append(np.where(known.density[inner] > 0, 0.0, found.sigma[inner])[seen])

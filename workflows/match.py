@@ -173,7 +173,8 @@ def between(job: Job, pair: PairTask, a: Entry, b: Entry, carried: tuple[Carried
         return Made({}, {"model": "", "matches": 0, "inliers": 0})
     if pair.wanted.turned[0] != pair.wanted.turned[1]:
         b = _half_turned(b)
-    ranges = [range_m for range_m in (a.info["range_m"], b.info["range_m"]) if range_m]
+    lit = [entry.info["range_m"] for entry, _ in (*carried[0], *carried[1])]
+    ranges = [range_m for range_m in (a.info["range_m"], b.info["range_m"]) if range_m] or [r for r in lit if r]
     at = float(np.mean(ranges)) if ranges else pair.wanted.range_m
     matched = _matches(job, a, b) if pair.poses is None else _expected(job, pair, pair.poses, a, b, at)
     soundings = _soundings(a, carried[0]), _soundings(b, carried[1])

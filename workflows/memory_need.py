@@ -16,6 +16,7 @@ from ..tasks.surface import halo_cells
 GIB: Final = 2**30
 _PROCESS: Final = 0.35 * GIB  # Python with all libraries
 _EACH_PIXEL: Final = 20  # of an image while it is measured, bytes
+_EACH_DECODED: Final = 15  # while 16 bits a channel are decoded
 _EACH_ADJUSTED: Final = 600_000  # of an image in the adjustment, bytes
 _EACH_CELL: Final = 200  # of a tile of the bathymetry with what surrounds it
 _EACH_TEXEL: Final = 45  # of a tile of the mosaic
@@ -30,12 +31,13 @@ class Need(NamedTuple):
     parameter: str = ""
 
 
-def needs(camera: Camera, parameters: Parameters, images: int, range_m: float) -> list[Need]:
+def needs(camera: Camera, parameters: Parameters, images: int, range_m: float, file_bytes: int = 0) -> list[Need]:
     """What the largest tasks need.
 
     Parameters
     ----------
-    images : how many of the mission are processed. range_m : typical height above the seabed.
+    images : how many of the mission are processed. range_m : typical height above the seabed. file_bytes : of the
+        largest image file; one is worked on while the next is being read.
     """
     pixels = camera.width * camera.height
     usual = grids.bathymetry_cell_m(ground_sample_distance(camera, range_m))
@@ -44,7 +46,7 @@ def needs(camera: Camera, parameters: Parameters, images: int, range_m: float) -
     reach = grids.max_interpolation_m(range_m) if across == "auto" else float(across)
     side = parameters.grid.tile_cells + 2 * halo_cells(reach, cell)
     texels = parameters.mosaic.tile_cells
-    image = _PROCESS + _EACH_PIXEL * pixels
+    image = _PROCESS + max(_EACH_PIXEL * pixels + file_bytes, _EACH_DECODED * pixels + 2 * file_bytes)
     return [
         Need(image, f"an image of {camera.width} x {camera.height} pixels"),
         Need(_PROCESS + _EACH_ADJUSTED * images, f"the adjustment of {images:,} images"),

@@ -124,15 +124,16 @@ def _write_tiles(
     pyramid = results.mapped.mesh
     written: dict[Place, tiles3d.Node] = {}
     for place, done in sorted(pyramid.items()):  # the finest first
-        if not done.info["triangles"]:
-            continue
-        uri = f"{place.level}/{place.column}_{place.row}.glb"
-        part = _part(results, place, done, origin)
-        tiles3d.write_content(folder / uri, part)
-        below = tuple(_children(written, place))
-        low = np.minimum.reduce([part.vertices.min(0), *(child.low for child in below)])
-        high = np.maximum.reduce([part.vertices.max(0), *(child.high for child in below)])
-        written[place] = tiles3d.Node(uri, low, high, done.info["error_m"], below)
+        below, uri = tuple(_children(written, place)), None
+        low, high = [child.low for child in below], [child.high for child in below]
+        if done.info["triangles"]:
+            uri = f"{place.level}/{place.column}_{place.row}.glb"
+            part = _part(results, place, done, origin)
+            tiles3d.write_content(folder / uri, part)
+            low, high = [part.vertices.min(0), *low], [part.vertices.max(0), *high]
+        if low:  # what is too narrow for a triangle at this level leads to the finer ones
+            error_m = done.info["error_m"] if uri else results.mapped.ground.grid.cell_m * 2**place.level
+            written[place] = tiles3d.Node(uri, np.min(low, 0), np.max(high, 0), error_m, below)
     top = max((place.level for place in written), default=0)
     roots = [node for place, node in written.items() if place.level == top]
     folder.mkdir(exist_ok=True)

@@ -90,10 +90,14 @@ def _levelled(m: MapJob, linked: Sequence[Pair], poses: Poses, number: dict[int,
     for pair in linked:
         arrays = load(m.job, match.STEP, pair.key, ("uv_i", "uv_j")).arrays
         every = -(-len(arrays["uv_i"]) // _ALIGNED_MATCHES)
-        for side, row, uv in ((0, pair.i, arrays["uv_i"][::every]), (1, pair.j, arrays["uv_j"][::every])):
+        levelled = []
+        for row, uv in ((pair.i, arrays["uv_i"][::every]), (pair.j, arrays["uv_j"][::every])):
             slopes = camera.normalised(m.job.calibration.camera, uv.astype(float), range_m)
-            sides[side].append(planar.level_slopes(poses.R_local_camera[row], slopes))
-            images[side].append(np.full(len(uv), number[row]))
+            levelled.append(planar.level_slopes(poses.R_local_camera[row], slopes))
+        known = np.isfinite(np.hstack(levelled)).all(1)
+        for side, (row, xy) in enumerate(zip((pair.i, pair.j), levelled, strict=True)):
+            sides[side].append(xy[known])
+            images[side].append(np.full(known.sum(), number[row]))
     none = [np.zeros((0, 2))], [np.zeros(0, int)]
     xy_i, xy_j = (np.concatenate(side + none[0]) for side in sides)
     image_i, image_j = (np.concatenate(side + none[1]) for side in images)
@@ -144,7 +148,7 @@ def _on_surface(
     m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], poses: Poses
 ) -> tuple[nodes.Ground, dict[int, Lie]]:
     """The tile's nodes on the surface, and how its images lie to them."""
-    around = ground_around(tile.grid, ground[0][0].cell_m, m.max_interpolation_m)
+    around = ground_around(tile.grid, m.cell_m, m.max_interpolation_m)
     elevation = np.full(around.shape, np.nan)
     for grid, done in ground:
         paste(around, elevation, grid, load(m.job, SURFACE, done.key, ("ground",)).arrays["ground"])

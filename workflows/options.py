@@ -36,13 +36,14 @@ def parameters(file: Path | None, overrides: list[str] | None) -> Parameters:
     return load_parameters(text, str(file), overrides or [])
 
 
-def cluster(file: Path | None, scheduler: str | None) -> Cluster | None:
-    """Of --cluster, which does not go with --scheduler."""
+def cluster(file: Path | None, scheduler: str | None, workers: int | None) -> Cluster | None:
+    """Of --cluster, which goes neither with --scheduler nor with --workers."""
     if file is None:
         return None
-    if scheduler is not None:
-        remedy = "Leave one of the two away."
-        raise InvalidInput([Problem("--cluster", None, "", "--cluster and --scheduler", "one of them", remedy)])
+    for name, given in (("--scheduler", scheduler), ("--workers", workers)):
+        if given is not None:
+            remedy = "Leave one of the two away."
+            raise InvalidInput([Problem("--cluster", None, "", f"--cluster and {name}", "one of them", remedy)])
     return load_model(_text(file, "--cluster", "a YAML file of a cluster"), str(file), Cluster)
 
 

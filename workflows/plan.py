@@ -21,6 +21,7 @@ _SEQUENTIAL_REACH = 3
 _BRIDGE_REACH = 16
 # A laser image taken within this of a texture image sounds for it, seconds
 _LIT_WITHIN_S = 10.0
+_NEAR_LIMIT = 1.1  # of the laser's range
 
 
 class Plan(NamedTuple):
@@ -94,9 +95,10 @@ def _prior(frames: xarray.Dataset, frame: MapFrame, opened: OpenedMission, param
     poses = navigation.camera_poses(safe, mount, frame)
     C = np.where(complete[:, None], poses.C_local, np.nan)
     time = frames["time"].values
+    since = time[complete][0] if complete.any() else time[0]  # a rejected image may have any time
     return NavigationPrior(
         poses=Poses(poses.R_local_camera, C),
-        time_s=(time - time[0]) / np.timedelta64(1, "s"),
+        time_s=(time - since) / np.timedelta64(1, "s"),
         sigma_horizontal=column("sigma_horizontal"),
         sigma_depth=column("sigma_depth"),
         sigma_attitude=np.radians(np.column_stack([column(f"sigma_{n}") for n in ("roll", "pitch", "heading")])),
@@ -213,8 +215,21 @@ def _overlapping(
 
 def _margin(prior: NavigationPrior) -> np.ndarray:
     """How far a footprint may be from where navigation has it, relative to those of neighbouring lines, (n,) m."""
-    drift = prior.drift_m_per_sqrt_s * np.sqrt(max(float(np.nanmax(prior.time_s)), 1.0))
+    elapsed = prior.time_s[prior.poses.known]
+    drift = prior.drift_m_per_sqrt_s * np.sqrt(max(float(elapsed.max(initial=1.0)), 1.0))
     return np.minimum(prior.sigma_horizontal, drift) / 2
+
+
+def beyond_the_laser(parameters: Parameters, height_m: float) -> str:
+    """What to say where the seabed is hardly within the distances at which the laser is sought; else nothing."""
+    least, most = parameters.laser.range_min_m, parameters.laser.range_max_m
+    if _NEAR_LIMIT * least < height_m < most / _NEAR_LIMIT:
+        return ""
+    name = "range_max_m" if height_m >= most / _NEAR_LIMIT else "range_min_m"
+    return (
+        f"cameras are {height_m:.1f} m above the seabed by the altimeter, and the laser is sought from {least:g} to "
+        f"{most:g} m: set laser.{name}"
+    )
 
 
 def batches(items: Sequence, size: int) -> list[Sequence]:

@@ -26,8 +26,10 @@ from ..schemas.products import (
 )
 from ..tasks.derivatives import Ring
 from ..tasks.rings import rings
-from . import calibration_quality, residual_quality
+from . import calibration_quality, plan, residual_quality
 from .results import Results, span, vertical_reference
+
+_MANY_DARK = 0.5  # of the images in which the laser should be
 
 
 def figures(
@@ -103,8 +105,21 @@ def _doubts(rows: Sequence[trajectories.Row], results: Results) -> Iterator[str]
             "poses are from the motions of pairs alone: tie points were too few, or with the laser's ranges left "
             "something open, such as the scale"
         )
+    yield from _dark(results)
     if results.posed.matched and not len(results.posed.solution.pairs):
         yield f"none of {len(results.posed.matched)} pairs of images could be linked"
+
+
+def _dark(results: Results) -> Iterator[str]:
+    """Whether the laser was missed where it should be."""
+    job, extracted = results.job, results.posed.extracted
+    lit = [extracted[image.row] for image in results.plan.images if image.role != "texture"]
+    dark = sum(not done.info["soundings"] for done in lit)
+    if job.calibration.laser is not None and dark > _MANY_DARK * len(lit):
+        height = float(np.median(results.plan.range_m))
+        measured = np.isfinite(results.opened.frames["altitude"].values).any()
+        why = plan.beyond_the_laser(job.parameters, height) if measured else ""
+        yield f"no laser was found in {dark} of {len(lit)} images that should show it" + (f"; {why}" if why else "")
 
 
 def _sounding_quality(results: Results, count: int) -> SoundingQuality | None:

@@ -62,7 +62,7 @@ def standing(out: str, mission_id: str, request: Request) -> Version | None:
     if newest is None:
         return None
     last = records.read_last_run(out, mission_id)
-    if last is not None and last.outcome == "done" and last.version == newest.number:
-        return newest if last.request == request.digest else None
+    if last is not None and last.outcome == "done" and (last.version, last.request) == (newest.number, request.digest):
+        return newest
     made = provenance(newest).get("request") or {}
     return newest if made.get("digest") == request.digest else None

@@ -105,15 +105,16 @@ def run(
         If no image gave a sounding or a match.
     """
     out, mission_url = absolute(out), absolute(mission_url)
-    if not is_remote(out) and Path(out).exists() and not Path(out).is_dir():
-        remedy = "Give -o a folder, which need not exist."
-        raise InvalidInput([Problem(out, None, "", "a file", "a folder", remedy)])
+    _refuse(out, mission_url)
     started = time.monotonic()
     with _reaching(out):
         known = memory.recall(mission_url, out)
     opened = memory.open_known(mission_url, out, known)
     mission_id = opened.mission.id
     log.info("mission=%s step=%s images=%d", mission_id, "open", opened.frames.sizes["image"])
+    for image, status in zip(*(opened.frames[of].values.tolist() for of in ("image", "status")), strict=True):
+        if status:
+            log.warning("mission=%s step=%s image=%s %s", mission_id, "open", image, status)
     asked = request.ask(memory.inputs_digest(opened), parameters, CODE)
     with _reaching(out):
         newest = request.standing(out, mission_id, asked)
@@ -135,12 +136,24 @@ def run(
     return result
 
 
+def _refuse(out: str, mission_url: str) -> None:
+    """Refuse an OUT that cannot hold products."""
+    if not is_remote(out) and Path(out).exists() and not Path(out).is_dir():
+        remedy = "Give -o a folder, which need not exist."
+        raise InvalidInput([Problem(out, None, "", "a file", "a folder", remedy)])
+    if f"{out.rstrip('/')}/".startswith(f"{mission_url.rstrip('/')}/"):
+        remedy = "Give -o a folder beside the mission; missions are never written to."
+        raise InvalidInput([Problem(out, None, "", "a folder of the mission itself", "another folder", remedy)])
+
+
 def _until_whole(job: Job, opened: OpenedMission, executor: Executor, asked: Request, out: str) -> RunResult:
     """Go over the steps, again where a stored result turns out to be damaged, which makes it anew."""
     made, lost = plan.plan(opened, job.parameters), set()
     typical = float(np.median(made.range_m))
     rings(job.parameters.terrain, memory_need.planned_cell_m(opened.calibration.camera, job.parameters, typical))
-    found = memory_need.needs(opened.calibration.camera, job.parameters, len(made.images), typical)
+    found = memory_need.needs(
+        opened.calibration.camera, job.parameters, len(made.images), typical, int(opened.frames["size"].max())
+    )
     memory_need.refuse_what_cannot_fit(found, executor.memory_bytes())
     while True:
         try:
@@ -261,7 +274,7 @@ def _close_loops(
     """
     job, made = state.job, state.plan
     extracted = _by_row(made, extracts)
-    ranges = np.array([mapping.range_of(extracted.get(k), r) for k, r in enumerate(made.range_m)])
+    ranges = mapping.heights(state, extracted)
     more = plan.chained_pairs if made.prior is None else plan.misplaced_pairs
     known = [(i, j) for i, j, done in matched if made.prior is None or done.info["model"]]
     for turn in range(_LOOP_ROUNDS if made.prior is None else 1):
@@ -280,7 +293,11 @@ def _close_loops(
         log.info("mission=%s step=%s later_pairs=%d linked=%d", job.mission_id, match.STEP, len(again), linked)
         if made.prior is not None and not solve.would_change(job, adjustments[-1], again, made.prior):
             break
-        adjustments += compute(state, "adjust", [_adjust_task(state, [matched], extracts, f"adjust-{turn}")])
+        whole = [
+            delayed(value, name=state.key(f"{name}-{turn}"), traverse=False)
+            for name, value in (("matched", matched), ("extracted", list(extracts)))
+        ]
+        adjustments += compute(state, "adjust", [_adjust_task(state, [whole[0]], whole[1], f"adjust-{turn}")])
     return matched
 
 
@@ -321,10 +338,10 @@ def _match_batch(
     return match.match_batch(job, batch, by_row, prior)
 
 
-def _adjust_task(state: Session, matches: Sequence[Any], extracts: Sequence[Any], name: str) -> Delayed:
+def _adjust_task(state: Session, matches: list[Any], extracts: Any, name: str) -> Delayed:
     count, made = state.opened.frames.sizes["image"], state.plan
     rows = [image.row for image in made.images]
-    given = (count, rows, list(matches), list(extracts), made.prior, made.R_first)
+    given = (count, rows, matches, extracts, made.prior, made.R_first)
     return delayed(_adjust)(state.job, *given, dask_key_name=state.key(name))
 
 

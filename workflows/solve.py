@@ -59,11 +59,13 @@ def adjust_all(
     if prior is not None:
         measured = (prior.time_s, prior.sigma_horizontal, prior.sigma_depth, prior.sigma_attitude)
         inputs.append(rounded_digest(*prior.poses, *measured))
-    inputs.append(rounded_digest(R_first))
+    first = min((row for row, done in extracted.items() if not done.info["status"]), default=0)
+    inputs.append(f"{first}:{rounded_digest(R_first)}")
     parameters = stage(job.calibration.camera, job.parameters.adjust)
 
     def make() -> Made:
-        chained = _chained(job, count, linked, prior, R_first)
+        links = _links(job, linked)
+        chained = adjust.adjust(count, links, prior, R_first, job.parameters.adjust, first)
         used = [pair for pair, ok in zip(linked, chained.used, strict=True) if ok]
         found = _bundle(job, chained, used, lit, prior)
         arrays = {
@@ -80,12 +82,6 @@ def adjust_all(
         return Made(arrays, {"status": found.status, "reprojection_px": found.reprojection_px})
 
     return once(job, STEP, VERSION, [str(count), *inputs], parameters, make)
-
-
-def _chained(
-    job: Job, count: int, linked: Sequence[tuple[int, int, Done]], prior: NavigationPrior | None, R_first: np.ndarray
-) -> Adjusted:
-    return adjust.adjust(count, _links(job, linked), prior, R_first, job.parameters.adjust)
 
 
 def _links(job: Job, linked: Sequence[tuple[int, int, Done]]) -> list[Link]:

@@ -104,6 +104,21 @@ def test_gaps() -> None:
         assert least < sigma[3] < 2 * least
 
 
+def test_gaps_are_those_of_each_column() -> None:
+    """Position and attitude on rows of their own; the compass fails for a minute, then position."""
+    seconds = np.arange(0, 200, 0.5)
+    attitude = np.arange(len(seconds)) % 2 == 1
+    lost = {"heading": (seconds > 20) & (seconds < 80), "latitude": (seconds > 110) & (seconds < 170)}
+    given = {name: attitude for name in ("roll", "pitch", "heading")}
+    given |= {name: ~attitude for name in ("latitude", "longitude", "depth")}
+    columns = {name: np.where(there & ~lost.get(name, False), 1.0, NAN) for name, there in given.items()}
+    poses = at(navigation(seconds, **columns), [10, 50, 100, 140])
+    assert poses.in_gap.tolist() == [False, True, False, True]
+    assert (poses.values["sigma_heading"] > 60).tolist() == [False, True, False, False]
+    assert (poses.values["sigma_horizontal"] > 2).tolist() == [False, False, False, True]
+    assert (poses.values["sigma_depth"] < 0.05).all()
+
+
 def test_slow_navigation_has_no_gaps() -> None:
     nav = navigation(np.arange(0, 200, 7.0))
     assert not at(nav, [3.5, 100.2]).in_gap.any()

@@ -28,6 +28,7 @@ def test_what_was_written_is_read(place):
     assert not json_files.exists(f"{place}/a.json")
 
 
+@pytest.mark.parametrize("place", ["local", "s3"], indirect=True)  # fsspec's memory knows no "only if it is new"
 def test_of_many_at_once_one_makes_it(place):
     def write(number):
         try:

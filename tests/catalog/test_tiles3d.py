@@ -44,6 +44,15 @@ def test_the_tree_refines_from_coarse_to_fine(tmp_path):
     assert [tile["geometricError"] for tile in _tiles(root)][2:] == [0, 0]
 
 
+def test_a_tile_without_triangles_leads_to_the_finer_ones(tmp_path):
+    tree = _tree()._replace(uri=None)
+    tiles3d.write_tileset(tmp_path / "tileset.json", [tree], UTM, ORIGIN, {})
+    (tile,) = json.loads((tmp_path / "tileset.json").read_text())["root"]["children"]
+    assert "content" not in tile
+    assert tile["geometricError"] > 0
+    assert [child["content"]["uri"] for child in tile["children"]] == ["0/0.glb", "0/1.glb"]
+
+
 def test_the_map_lies_where_it_is_on_the_earth(tmp_path):
     matrix = np.array(_written(tmp_path)["root"]["transform"]).reshape(4, 4).T
     to_earth = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)

@@ -149,12 +149,23 @@ def test_laser_images_need_a_laser(tiny_mission: Path, role: str) -> None:
     edit(tiny_mission / "mission.yaml", (role, "texture"))
     assert open_mission(str(tiny_mission)).warnings == []
     without_navigation(tiny_mission)
-    assert "scale" in open_mission(str(tiny_mission)).warnings[0]
+    assert problem(tiny_mission).expected == "something that tells the scale"
 
 
 def test_a_wrong_laser_is_not_called_missing(tiny_mission: Path) -> None:
     edit(tiny_mission / "calibration.yaml", ("angle: 25", "angle: 95"))
     assert problem(tiny_mission).key == "laser.planes.angle"
+
+
+def test_laser_and_texture_apart_need_navigation(tiny_mission: Path) -> None:
+    line = "  - {path: 'images/*.jpg', role: combined}\n"
+    parts = [
+        line.replace("*", glob).replace("combined", role)
+        for glob, role in (("*[02468].*", "laser"), ("*[13579].*", "texture"))
+    ]
+    edit(tiny_mission / "mission.yaml", (line, "".join(parts)))
+    without_navigation(tiny_mission)
+    assert problem(tiny_mission).expected == "something that tells the scale"
 
 
 def test_laser_images_alone_need_navigation(tiny_mission: Path) -> None:

@@ -52,6 +52,7 @@ def test_what_is_selected(text, selected):
         ("id[0] == 'v'", "no comparison"),
         ("platform = 'Vortex'", "syntax"),
         ("platform == b'x'", "the value b'x'"),
+        ("start >= 2026", "a text beside a number"),
         ("", "syntax"),
     ],
 )

@@ -1,5 +1,7 @@
 """Segmentation of the cross (paper III.C) from points made by geometry, without images."""
 
+import functools
+
 import numpy as np
 import pytest
 from seamosaic.schemas.calibration import Camera, CrossGeometry, Laser
@@ -14,6 +16,7 @@ INVERSE_RANGE = (1 / PARAMETERS.range_max_m, 1 / PARAMETERS.range_min_m)
 SHAPE = (CAMERA.height, CAMERA.width)
 
 
+@functools.cache
 def cross_points(depth, noise_px: float = 0.2, seed: int = 0) -> tuple[laser.LaserPoints, np.ndarray]:
     """Points of the cross on a bottom of depth(x_m, y_m), found row by row on the image, and their true arm."""
     rng = np.random.default_rng(seed)

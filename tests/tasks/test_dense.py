@@ -51,7 +51,7 @@ def _match(lens, poses, erase=None, spoil=None, scale=1):
         sights.append(dense.sight(lens, made, poses.R_local_camera[k], k == 1))
         warped.append(dense.warp(made, sights[k], grey, hidden, scale))
     found = dense_refine.refine(dense.disparity(made, warped[0], warped[1]), warped[0], warped[1])
-    return made, found.disparity, dense.points(made, found, sights[0], sights[1])
+    return made, found.disparity, dense.points(made, found, sights[0], sights[1], 2)
 
 
 @pytest.mark.parametrize("model", LENSES)
@@ -110,3 +110,7 @@ def test_pairs_that_say_nothing_of_depth_are_refused():
     lens = LENSES["brown"]
     for second in ([0, 0, 0], [0, 0, 0.8], [6, 0, 0]):
         assert dense.rectify(lens, scenes.cameras([[0, 0, 0], second], tilt_deg=0), 0, 1, DEPTHS, 1.0) is None
+
+
+def test_small_cells_get_every_point_that_there_is():
+    assert [dense.spacing(pixels) for pixels in (1.5, 4.9, 5.0, 20.0)] == [1, 1, 2, 2]

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from seamosaic.tasks import dense_cells
 from seamosaic.tasks.dense_cells import departures, differences, reduce_to_cells, share_of_each
 
@@ -77,3 +78,12 @@ def test_only_what_poses_do_is_told_of_laser_and_matching():
     assert 0.0025 < np.median(raised.metres) < 0.0035
     assert np.allclose(raised.px, raised.metres / 0.01)
     assert not len(departures(cells[:5], scale[:5], laser, 0.02).px)
+
+
+@pytest.mark.parametrize(("points_a_cell", "share"), [(np.inf, 0.6), (4.0, 0.85), (1.0, 1.0)])
+def test_a_cell_that_can_have_few_points_needs_half_of_them(points_a_cell, share):
+    rng = np.random.default_rng(4)
+    X = _floor(rng, 1200)  # three in each of 400 cells on average
+    cells = reduce_to_cells(X, np.full(len(X), 0.005), np.full(len(X), 0.1), X[:100], 0.05, points_a_cell)
+    hit = len(np.unique(np.floor(X[:, :2] / 0.05), axis=0))
+    assert len(cells.X_map) / hit == pytest.approx(share, abs=0.05)

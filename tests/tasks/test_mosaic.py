@@ -319,3 +319,12 @@ def test_a_steep_side_is_shown_by_the_image_that_faces_it():
     side = (x > 0.09) & (x < 0.13) & (np.abs(y) < 0.3)
     assert (sources(ramp)[side] == 0).mean() > 0.9
     assert (sources(flat)[side] == 0).mean() < 0.3
+
+
+def test_many_images_of_one_place_are_no_brighter_than_one():
+    """A vehicle at rest: shares of 255 must not add up to more."""
+    first = photograph(*pose(0.0, 0.0, 0.0, 20), flat, 0)
+    views = [first._replace(number=k, image=np.full_like(first.image, 100)) for k in range(95)]
+    result = compose(TILE, terrain_of(flat), views)
+    assert result.mask.mean() > 0.5
+    assert np.abs(result.rgb[:, result.mask].astype(int) - 100).max() <= 1

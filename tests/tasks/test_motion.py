@@ -110,12 +110,12 @@ def test_on_a_narrow_strip_navigation_leads_to_the_right_motion():
     assert rotations.angle_between_deg(R, found.R_i_j) < 2.0
 
 
-def test_unrelated_images_have_no_motion():
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize("seed", range(5))
+def test_unrelated_images_have_no_motion(seed: int):
+    rng = np.random.default_rng(seed)
     x_i, x_j = rng.uniform(-0.3, 0.3, (2, 60, 2))
     none = np.zeros((0, 3))
-    found = motion.estimate(x_i, x_j, none, none, scenes.FOCAL_PX, P)
-    assert found is None or len(found.inliers) < 25
+    assert motion.estimate(x_i, x_j, none, none, scenes.FOCAL_PX, P) is None
     assert motion.estimate(x_i[:5], x_j[:5], none, none, scenes.FOCAL_PX, P) is None
 
 

@@ -29,6 +29,21 @@ def test_camera_looks_down_and_its_top_to_the_bow():
     np.testing.assert_allclose(poses.R_local_camera[0] @ [0, -1, 0], [1, 0, 0], atol=1e-9)  # heading east
 
 
+@pytest.mark.parametrize("place", [(6.5, 43.0), (6.6, 43.05), (179.99, -77.0), (8.0, 89.0)])
+def test_level_is_at_the_vehicle(place):
+    """A vehicle that says it is level and heads north does so where it is."""
+    frame = MapFrame(FRAME.crs, 89.0 if place[1] > 80 else 43.0, 6.5)
+    state = _state(0)._replace(longitude=np.array([place[0]]), latitude=np.array([place[1]]))
+    R = navigation.camera_poses(state, Mount(), frame).R_local_camera[0]
+    ends = [np.array([place]) + step for step in ([0.0, 0.0], [0.0, 1e-5])]
+    south, north, above = (
+        frame.local_from_geographic(*at.T, np.array([height]))[0]
+        for at, height in ((ends[0], 0.0), (ends[1], 0.0), (ends[0], 1.0))
+    )
+    np.testing.assert_allclose(R @ [0, 0, -1], above - south, atol=1e-6)
+    np.testing.assert_allclose(R @ [0, -1, 0], (north - south) / np.linalg.norm(north - south), atol=1e-6)
+
+
 def test_first_camera_without_navigation_is_level():
     np.testing.assert_allclose(navigation.first_camera_without_navigation(Mount()), np.diag([1.0, -1, -1]), atol=1e-12)
 

@@ -37,8 +37,8 @@ def test_level_slopes_point_east_and_north():
     ground = np.array([[0.4, -0.2, -3.0], [-0.1, 0.9, -3.0]])
     X = ground @ R
     np.testing.assert_allclose(planar.level_slopes(R, X[:, :2] / X[:, 2:]), ground[:, :2] / 3, atol=1e-12)
-    with pytest.raises(ValueError, match="horizon"):
-        planar.level_slopes(pose(0, 0, 0, 0, 0, 80)[0], np.array([[0.0, -2.0]]))
+    up_and_down = planar.level_slopes(pose(0, 0, 0, 0, 0, 80)[0], np.array([[0.0, -2.0], [0.0, 2.0]]))
+    assert np.isfinite(up_and_down).all(1).tolist() == [False, True]
 
 
 def test_alignment_recovers_the_similarities():

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import fsspec
@@ -262,10 +262,13 @@ def test_a_failure_is_told_and_tried_again(archive, tiny_mission):
 def _kill_a_mission(steps: Path) -> None:
     """Kill the process that works on a mission: a child of a child of this one, the server that forks them."""
     _until(lambda: steps.exists())
-    us = psutil.Process()
-    for process in us.children(recursive=True):
-        if process.ppid() != us.pid:
-            process.kill()
+    us, killed = psutil.Process(), []
+    while not killed:
+        for process in us.children(recursive=True):
+            with suppress(psutil.NoSuchProcess):  # it ended meanwhile
+                if process.ppid() != us.pid:
+                    process.kill()
+                    killed.append(process)
 
 
 def _until(happened, process=None) -> None:
@@ -282,11 +285,16 @@ def test_a_run_that_was_killed_frees_its_missions_and_ends_its_processes(archive
     process = subprocess.Popen([*RUN, str(archive)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _until(lambda: list((archive / "products").glob("plane-0/steps/extract/*/*.npz")), process)
     children = psutil.Process(process.pid).children(recursive=True)
+    at_work = [child for child in children if child.ppid() != process.pid]
+    for child in at_work:
+        child.suspend()  # however long it takes to look at it
     running = state_of(archive)
     assert running.state == "running"
     assert f"process {process.pid} on" in running.why
     busy = run_archive(open_archive(str(archive)), SYNC)
     assert [one.outcome for one in busy.missions] == ["running", "current"]
+    for child in at_work:
+        child.resume()
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     _, alive = psutil.wait_procs(children, timeout=60)

@@ -122,3 +122,11 @@ def test_a_wrong_mission_is_told_in_full(tiny_mission: Path) -> None:
 def test_a_place_that_is_not_there(tmp_path: Path) -> None:
     result = check(str(tmp_path / "nowhere"), DEFAULT)
     assert ": 1 problem\n" in printed(result)
+
+
+def test_heights_at_which_the_laser_is_not_sought(tiny_mission: Path) -> None:
+    assert not any("laser" in warning for warning in check(str(tiny_mission), DEFAULT).warnings)
+    for limits, name in (({"range_max_m": 3.0}, "range_max_m"), ({"range_min_m": 3.0}, "range_min_m")):
+        parameters = Parameters.model_validate({"laser": limits})
+        (warning,) = (text for text in check(str(tiny_mission), parameters).warnings if "laser" in text)
+        assert f"set laser.{name}" in warning

@@ -73,6 +73,8 @@ def test_a_json_log_is_one_object_a_line(reef, tiny_mission, monkeypatch, capfd)
     assert _main(monkeypatch, "run", tiny_mission, "-o", tiny_mission.parent / "out", *options) == 1
     lines = [json.loads(line) for line in capfd.readouterr().err.splitlines()]
     assert "nothing to map" in lines[-1]["message"]
+    (rejected,) = (line for line in lines if line["step"] == "open" and "image" in line)
+    assert rejected["message"].startswith("rejected")
     (extract,) = (line for line in lines if line["step"] == "poses")
     assert extract["done"] == extract["total"] > 1
     assert _main(monkeypatch, "run", tiny_mission / "nowhere", "-o", tiny_mission.parent / "out", *options) == 2

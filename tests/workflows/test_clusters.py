@@ -11,7 +11,7 @@ from distributed.system import MEMORY_LIMIT
 from seamosaic.schemas.cluster import Cluster
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.yaml_input import load_model
-from seamosaic.workflows import clusters, executor, heap
+from seamosaic.workflows import clusters, executor, heap, options
 
 SLURM = """\
 kind: slurm
@@ -84,12 +84,12 @@ def test_a_cluster_that_begins_without_workers_gets_one():
         assert running.compute([delayed(sum)([1, 2])], lambda _: None) == [3]
 
 
-@pytest.mark.parametrize(("name", "value"), [*heap.WORKER_ENVIRONMENT.items(), ("OMP_NUM_THREADS", 1)])
-def test_workers_keep_freed_memory_for_the_next_array_and_one_thread(name, value):
+def test_workers_keep_freed_memory_for_the_next_array_and_one_thread():
     with executor.open_executor(None, 1) as running:
         assert isinstance(running, executor.ClusterExecutor)
-        (found,) = running.client.run(os.environ.get, name).values()
-    assert found == str(value)
+        (found,) = running.client.run(lambda: dict(os.environ)).values()
+    wanted = {**heap.WORKER_ENVIRONMENT, "OMP_NUM_THREADS": 1}
+    assert {name: found[name] for name in wanted} == {name: str(value) for name, value in wanted.items()}
 
 
 @pytest.mark.slow
@@ -126,3 +126,12 @@ def test_what_is_wrong_with_a_cluster_file(text, key):
         load_model(text, "cluster.yaml", Cluster)
     assert [problem.key for problem in caught.value.problems] == [key]
     assert all(problem.remedy for problem in caught.value.problems)
+
+
+def test_what_would_be_passed_over_is_refused(tmp_path):
+    with pytest.raises(InvalidInput, match="workers"):
+        load_model("kind: local\ncores: 8\n", "cluster.yaml", Cluster)
+    file = tmp_path / "cluster.yaml"
+    file.write_text("kind: local\n")
+    with pytest.raises(InvalidInput, match="--cluster and --workers"):
+        options.cluster(file, None, 8)

@@ -44,7 +44,7 @@ def downloaded(path, folder: Path) -> Path:
     return folder
 
 
-def test_two_workers_without_a_shared_disk_give_what_one_thread_gives(reef, s3, workers, tmp_path):
+def test_two_workers_without_a_shared_disk_give_what_one_thread_gives(reef, s3, workers, tmp_path, monkeypatch):
     mission = uploaded(s3, reef.mission, "reef")
     result = run(mission, s3.url("maps"), Parameters(), scheduler=workers)
     assert (str(result.path), result.new) == (s3.url("maps", result.quality.mission.id, "v1"), True)
@@ -52,8 +52,10 @@ def test_two_workers_without_a_shared_disk_give_what_one_thread_gives(reef, s3, 
     fs = s3fs.S3FileSystem(use_listings_cache=False)
     left = [path for path in fs.find(f"{s3.bucket}/maps") if "/.tmp/" in path or "/.claims/" in path]
     assert left == []
+    monkeypatch.setitem(runner.CODE, "workflow", "another")  # so that it goes over the steps again
     again = run(mission, s3.url("maps"), Parameters(), scheduler=workers)
     assert (again.new, sum(step.count_computed for step in again.steps)) == (False, 0)
+    assert sum(step.count_reused for step in again.steps) > 10
     assert [version.number for version in versions.list_versions(s3.url("maps"), result.quality.mission.id)] == [1]
 
 

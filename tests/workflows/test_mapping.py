@@ -4,12 +4,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import xarray
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from seamosaic.tasks import grids
 from seamosaic.tasks.grids import Grid
 from seamosaic.workflows import mapping, products
+from seamosaic.workflows.job import Done
 from seamosaic.workflows.maps_inputs import Image, Pair
 
 
@@ -40,7 +42,8 @@ def test_images_are_found_where_their_footprints_with_a_margin_touch():
     outlines = np.stack([square, square + 5, square + (20, 0)])
     images = [image(0), image(2)]
     footprints = mapping._Footprints(outlines, images)
-    margin = mapping._margin(outlines, images)
+    margin, other = mapping._margins(outlines, images).tolist()
+    assert margin == other
     assert footprints.touching(Grid(1.0, 3, 2, 2, 2)) == ()
     assert 0 < margin < 1
     assert footprints.touching(Grid(0.1, 20, 20, 5, 5)) == (images[0],)
@@ -62,3 +65,12 @@ def test_sigmas_are_along_the_axes_of_the_map(turn_deg: float):
     solution = SimpleNamespace(sigma_m=np.sqrt(np.diag(covariance))[None], covariance_xy_m2=covariance[None, 0, 1])
     (sigma,) = products._along_map_axes(solution, R_map_local[None], [0])  # pyright: ignore[reportArgumentType]
     assert sigma == pytest.approx(drawn.std(0), rel=0.01)
+
+
+@pytest.mark.parametrize(("altitude", "expected"), [(np.nan, [6, 6, 6.5, 7, 7]), (4.0, [3, 6, 3, 7, 3])])
+def test_heights_are_the_lasers_then_the_altimeters_then_those_around(altitude: float, expected: list[float]):
+    frames = xarray.Dataset({"altitude": ("image", np.full(5, altitude))})
+    state = SimpleNamespace(plan=SimpleNamespace(range_m=np.full(5, 3.0)), opened=SimpleNamespace(frames=frames))
+    told = {0: None, 1: 6.0, 3: 7.0}
+    extracted = {row: Done("extract", "", True, 0.0, {"range_m": value}) for row, value in told.items()}
+    assert mapping.heights(state, extracted).tolist() == expected  # pyright: ignore[reportArgumentType]

@@ -41,6 +41,12 @@ def test_what_grows_with_the_mission_and_what_does_not(tiny_mission):
     assert 4.7 < grown[1] / GIB < 6.0  # 10,000 images with few soundings took 5.1 with Python and all (benchmarks)
 
 
+def test_large_files_count(tiny_mission):
+    calibration = Calibration.model_validate(yaml.safe_load((tiny_mission / "calibration.yaml").read_text()))
+    small, large = (memory_need.needs(calibration.camera, Parameters(), 6, 2.7, size)[0].size for size in (0, GIB))
+    assert 1.9 * GIB < large - small <= 2 * GIB  # the one that is worked on, and the next
+
+
 def test_without_a_limit_nothing_is_refused(tiny_mission):
     memory_need.refuse_what_cannot_fit(need(tiny_mission, Parameters(), 10**6), None)
 

@@ -26,6 +26,9 @@ LOADED = "import sys, seamosaic.workflows.run; print(*(name for name in sys.modu
 
 def test_every_module_behind_the_products_is_in_the_code_of_a_request(monkeypatch):
     """A module that is forgotten would leave versions current that its change made stale."""
+    for part, deciding in (("products", products), ("opening", request), ("workflow", run)):
+        assert run.CODE[part] == job.code_version(*deciding.DECIDING)
+    assert run._VERSIONS.items() <= run.CODE.items()
     seen = {}
     monkeypatch.setattr(job.inspect, "getsource", lambda module: seen.setdefault(module.__name__, "") and "")
     steps = ("dense", "extract", "layers", "maps", "match", "meshing", "mosaics", "solve", "products")
@@ -79,6 +82,8 @@ def test_other_software_that_comes_to_the_same_is_looked_at_once(reef, tmp_path,
     again = run.run(str(reef.mission), out, Parameters(), scheduler="sync")
     assert (again.path.name, again.new) == ("v1", False)
     assert sum(step.count_reused for step in again.steps) == sum(step.count_total for step in again.steps) > 10
+    assert run.run(str(reef.mission), out, Parameters(), scheduler="sync").steps == ()
+    monkeypatch.undo()  # two machines with unlike software take turns
     assert run.run(str(reef.mission), out, Parameters(), scheduler="sync").steps == ()
 
 
