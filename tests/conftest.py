@@ -8,8 +8,12 @@ import cv2
 import numpy as np
 import pytest
 import s3fs
+from hypothesis import settings
 
 from tests.fleet import S3, s3_server
+
+settings.register_profile("tests", deadline=None, max_examples=60)  # time is no measure on a loaded machine
+settings.load_profile("tests")
 
 MISSION = """\
 format: 1

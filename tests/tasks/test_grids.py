@@ -1,12 +1,9 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from seamosaic.tasks import grids
 from seamosaic.tasks.grids import Bounds, Grid
-
-settings.register_profile("grids", deadline=None, max_examples=60)
-settings.load_profile("grids")
 
 metres = st.floats(-5e6, 5e6)
 lengths = st.floats(0.01, 40)
