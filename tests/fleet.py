@@ -1,5 +1,6 @@
 """A scheduler, workers and an S3 server, each a process of its own on a free port of this machine."""
 
+import itertools
 import json
 import os
 import signal
@@ -8,18 +9,26 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
 HERE = Path(__file__).parent
 PATIENCE_S = 180
+_PORTS = range(20_000, 32_000)
+_given: set[int] = set()
 
 
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    """A port below those that the system gives away by itself: nobody takes it until a server has started."""
+    first = _PORTS.start + os.getpid() % 100 * 100  # other processes of the tests look elsewhere first
+    for port in itertools.chain(range(first, _PORTS.stop), range(_PORTS.start, first)):
+        if port not in _given:
+            _given.add(port)
+            with socket.socket() as probe, suppress(OSError):
+                probe.bind(("127.0.0.1", port))
+                return port
+    raise RuntimeError("no port is free")
 
 
 def wait_for_port(port: int, process: subprocess.Popen) -> None:
