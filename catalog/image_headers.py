@@ -44,12 +44,12 @@ def read_header(head: bytes, tail: bytes, whole: BinaryIO) -> Header:
     Parameters
     ----------
     head, tail : first and last bytes of the file (HEADER_BYTES and TAIL_BYTES, or the whole of a smaller one).
-    whole : the file, open, for TIFF.
+    whole : the file, open, for TIFF and what of a JPEG's header lies behind head.
     """
     if not head:
         return Header(0, 0, "", "file is empty")
     if head[:2] == b"\xff\xd8":
-        return _jpeg(head, tail)
+        return _jpeg(head, tail, whole)
     if head[:8] == b"\x89PNG\r\n\x1a\n":
         return _png(head, tail)
     if head[:4] in (b"II*\0", b"MM\0*"):
@@ -57,18 +57,23 @@ def read_header(head: bytes, tail: bytes, whole: BinaryIO) -> Header:
     return Header(0, 0, "", "not a JPEG, PNG or TIFF image")
 
 
-def _jpeg(head: bytes, tail: bytes) -> Header:
+def _jpeg(head: bytes, tail: bytes, whole: BinaryIO) -> Header:
+    def at(place: int, count: int) -> bytes:
+        if place + count <= len(head):
+            return head[place : place + count]
+        whole.seek(place)
+        return whole.read(count)
+
     width, height, exif, position = 0, 0, b"", 2
-    while position + 4 <= len(head) and head[position] == 0xFF:
-        marker, length = head[position + 1], int.from_bytes(head[position + 2 : position + 4], "big")
+    while len(start := at(position, 4)) == 4 and start[0] == 0xFF:
+        marker, length = start[1], int.from_bytes(start[2:], "big")
         if marker == 0xFF:  # padding
             position += 1
             continue
-        body = head[position + 4 : position + 2 + length]
-        if marker in _START_OF_FRAME and len(body) >= 5:
+        if marker in _START_OF_FRAME and len(body := at(position + 4, 5)) == 5:
             height, width = int.from_bytes(body[1:3], "big"), int.from_bytes(body[3:5], "big")
-        if marker == 0xE1 and body[:6] == b"Exif\0\0":
-            exif = exif or body[6:]
+        if marker == 0xE1 and at(position + 4, 6) == b"Exif\0\0":
+            exif = exif or at(position + 10, length - 8)
         position += 2 + length
         if marker == _SCAN:
             break

@@ -72,6 +72,12 @@ def test_the_end_of_a_thumbnail_is_not_the_end() -> None:
     assert "truncated" in header(whole[: len(whole) - 500]).fault
 
 
+def test_a_header_longer_than_what_is_looked_at_first() -> None:
+    content, extra = with_exif("JPEG", {TIME: "2026:06:03 02:14:10"}), b"\xff\xe2\xff\xff" + bytes(0xFFFD)
+    assert header(content[:2] + 6 * extra + content[2:]) == Header(96, 64, "2026-06-03T02:14:10Z", "")
+    assert "truncated" in header(content[:2] + 6 * extra).fault
+
+
 @pytest.mark.parametrize(
     ("content", "word"),
     [
