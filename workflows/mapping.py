@@ -46,14 +46,17 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     enough = _LEAST_SEEN if p.grid.max_sigma_m == "auto" else 1.0
     m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst, enough)
     outlines = _outlines(state, posed.solution, ranges)
-    # what is costly does not change with the bathymetry's cell: matching is kept as fine as either of the cells, and
-    # mosaics and mesh lie on a surface of their own
+    # what is costly does not change with the bathymetry's cell: matching is kept as fine as either of the cells,
+    # mosaics and mesh lie on a surface of the usual ones, and coarser ones are made of it
     usual = grids.bathymetry_cell_m(gsd)
     linked, agreed = _dense(state, m._replace(cell_m=min(cell, usual)), posed, images, outlines, ranges)
-    surface_tiles = _surface(state, m, linked, agreed, images, outlines)
-    terrain = _layers(state, m, surface_tiles)
     below = m._replace(cell_m=usual)
-    ground = surface_tiles if below == m else _surface(state, below, linked, agreed, images, outlines)
+    ground = surface_tiles = _surface(state, below, linked, agreed, images, outlines)
+    if cell < usual:
+        surface_tiles = _surface(state, m, linked, agreed, images, outlines)
+    elif cell > usual:
+        surface_tiles = _coarser(state, m, ground, _bounds(outlines, images))
+    terrain = _layers(state, m, surface_tiles)
     textured = [image for image in images if image.texture]
     light = _lighting(state, below, textured)
     mosaic = _mosaics(state, below, textured or images, outlines, ground, mosaic_cell, light, posed)
@@ -228,8 +231,7 @@ def _surface(
 ) -> Tiles:
     """Bathymetry: cells of each tile, the law of interpolation, then the surface of each tile."""
     size = state.job.parameters.grid.tile_cells
-    bounds = _bounds(outlines, images)
-    grid = grids.pad(grids.grid_around(bounds, m.cell_m), 2)
+    grid = _map_grid(_bounds(outlines, images), m.cell_m)
     steps = (maps.CELLS, maps.GROWTH, maps.SURFACE)
     for step in steps:
         state.ledger.begin(step)
@@ -268,6 +270,27 @@ def _surface(
     for step, done in zip(steps, (cells, [growth], surfaces), strict=True):
         state.ledger.end(step, done)
     return Tiles(grid, tuple((tile, done) for (tile, _), done in zip(around, surfaces, strict=True)))
+
+
+def _map_grid(bounds: grids.Bounds, cell_m: float) -> Grid:
+    return grids.pad(grids.grid_around(bounds, cell_m), 2)
+
+
+def _coarser(state: Session, m: MapJob, ground: Tiles, bounds: grids.Bounds) -> Tiles:
+    """Bathymetry on cells coarser than those of the ground."""
+    grid, placed = _map_grid(bounds, m.cell_m), _Placed(ground.tiles)
+    tiles = [
+        (tile, near)
+        for tile in grids.tiles(grid, state.job.parameters.grid.tile_cells)
+        if (near := placed.overlapping(grids.pad(grids.grid_around(tile.bounds, ground.grid.cell_m), 1)))
+    ]
+    tasks = [
+        delayed(maps.coarse_tile)(m, tile, near, dask_key_name=state.key(f"surface-{m.cell_m:g}", k))
+        for k, (tile, near) in enumerate(tiles)
+    ]
+    done: list[Done] = compute(state, maps.SURFACE, tasks)
+    state.ledger.end(maps.SURFACE, done)
+    return Tiles(grid, tuple((tile, one) for (tile, _), one in zip(tiles, done, strict=True)))
 
 
 def _layers(state: Session, m: MapJob, surface: Tiles) -> TerrainLayers:

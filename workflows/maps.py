@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..tasks import gridding, grids, smooth, surface
+from ..tasks import coarsening, gridding, grids, smooth, surface
 from ..tasks.gridding import LASER, MATCHING, Cells, Soundings
 from ..tasks.grids import Grid
 from ..tasks.surface import Growth
@@ -190,6 +190,26 @@ def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]],
 
     parameters = [list(tile), m.max_interpolation_m, worst, list(law)]
     return once(m.job, SURFACE, _VERSION, inputs, parameters, make, compress=True)
+
+
+def coarse_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]]) -> Done:
+    """The surface of a tile of coarser cells, from the tiles of the usual ones over it."""
+    inputs, usual = [done.key for _, done in neighbours], neighbours[0][0].cell_m
+    worst = neighbours[0][1].info["max_sigma_m"]
+
+    def make() -> Made:
+        around = grids.pad(grids.grid_around(tile.bounds, usual), 1)
+        values = {name: np.full(around.shape, np.nan) for name in ("elevation", "sigma")}
+        values |= {name: np.zeros(around.shape, np.int64) for name in ("source", "density")}
+        for grid, done in neighbours:
+            arrays = load(m.job, SURFACE, done.key, values).arrays
+            for name, whole in values.items():
+                paste(around, whole, grid, arrays[name])
+        found = coarsening.coarsen(around, **values, coarse=tile)._asdict()
+        layers = {name: a.astype(np.float32) if a.dtype == float else a for name, a in found.items()}
+        return Made(layers, {"cells": int(np.isfinite(found["elevation"]).sum()), "max_sigma_m": worst})
+
+    return once(m.job, SURFACE, _VERSION, inputs, [list(tile), worst], make, compress=True)
 
 
 def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]]) -> Cells:

@@ -251,7 +251,8 @@ def test_another_cell_size_makes_the_bathymetry_only(reef, tmp_path, monkeypatch
     computed = _computed(result)
     kept = ("extract", "match", "adjust", "ties", "dense", "agreement", "lighting", "planar-align", "mosaic", "mesh")
     assert {step: computed[step] for step in kept} == dict.fromkeys(kept, 0)
-    assert computed["cells"] > 0
+    assert computed["surface"] == computed["terrain"] > 0
+    assert (computed["cells"] > 0) == (reef.result.quality.bathymetry.cell_m > 0.05)  # coarser ones are made of these
     assert result.path.name == "v2"
     with (
         rasterio.open(result.path / "bathymetry.tif") as new,
