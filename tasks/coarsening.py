@@ -62,8 +62,9 @@ def coarsen(fine: Grid, elevation: Array, sigma: Array, source: NDArray, density
 def _weights(coarse: Grid, fine: Grid) -> tuple[sparse.csr_array, sparse.csr_array]:
     """Weights of rows, and of columns, of the fine grid in the integrals over those of the coarse one, metres."""
     x, y = axes(fine)
-    south, west = (coarse.top - np.arange(coarse.height + 1)) * coarse.cell_m, coarse.left + np.arange(coarse.width + 1)
-    return _integrals(-south, -y, fine.cell_m), _integrals(west * coarse.cell_m, x, fine.cell_m)
+    rows, columns = (np.arange(count + 1, dtype=np.float64) for count in coarse.shape)
+    south, west = (rows - coarse.top) * coarse.cell_m, (columns + coarse.left) * coarse.cell_m
+    return _integrals(south, -y, fine.cell_m), _integrals(west, x, fine.cell_m)
 
 
 def _integrals(edges: Array, centres: Array, step: float) -> sparse.csr_array:

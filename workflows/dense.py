@@ -107,7 +107,7 @@ def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
     found = dense_refine.refine(dense.disparity(made, *warped), *warped)
     pixels_a_cell = m.cell_m * made.focal_px / float(np.median(depth))
     every = dense.spacing(pixels_a_cell)
-    relief = dense.points(made, found, *sights, every)
+    relief = dense.points(made, found, *sights, every=every)
     # cells in one window share its noise, and what smooths them takes them for independent
     noise_px = relief.noise_px * max(1.0, dense_refine.WINDOW_PX / pixels_a_cell / _WINDOW_CELLS)
 
