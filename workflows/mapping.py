@@ -232,6 +232,8 @@ def _surface(
     """Bathymetry: cells of each tile, the law of interpolation, then the surface of each tile."""
     size = state.job.parameters.grid.tile_cells
     grid = _map_grid(_bounds(outlines, images), m.cell_m)
+    if m.least_seen < 1:  # the limit is ours: what a bend of the whole does to guesses it does to all cells
+        m = m._replace(max_sigma_m=round(float(np.hypot(m.max_sigma_m, maps.bend_m(m, agreed))), 6))
     steps = (maps.CELLS, maps.GROWTH, maps.SURFACE)
     for step in steps:
         state.ledger.begin(step)

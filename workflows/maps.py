@@ -29,7 +29,7 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
     """Soundings, tie points and dense matching of a tile, gridded. agreed : by `dense.agreement`."""
     solution = relative(solve.solution(m.job, m.adjusted), agreed.info["laser_m"])
     # what was found and not from what: another image elsewhere is no reason to make this tile anew
-    said = [agreed.info[name] for name in ("dense_px", "tie_px")] + [round(_bend_m(solution, agreed), 4)]
+    said = [agreed.info[name] for name in ("dense_px", "tie_px")] + [round(_bend_m(solution), 4)]
     inputs = [f"{image.row}:{image.key}" for image in tile.images] + [pose_digest(solution, rows_of(tile))]
     inputs += [f"{pair.i}-{pair.j}:{pair.ties}:{pair.dense}" for pair in tile.pairs]
 
@@ -42,7 +42,7 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
                 parts.append(_within(tile.grid, _dense(m, pair, count, agreed.info["dense_px"])))
         soundings = Soundings._make(np.concatenate(column) for column in zip(_NOTHING, *parts, strict=True))
         cells = gridding.grid_soundings(tile.grid, soundings)
-        cells = cells._replace(sigma=np.hypot(cells.sigma, np.sqrt(_BEND) * said[-1]))
+        cells = cells._replace(sigma=np.hypot(cells.sigma, said[-1]))
         at = np.flatnonzero(cells.density)
         sounded = {name: values.ravel()[at] for name, values in cells._asdict().items()}
         return Made({"cell": at.astype(np.int32), **sounded}, {"sounded": len(at)})
@@ -70,12 +70,15 @@ def relative(solution: Solution, measured_m: float) -> Solution:
     return solution._replace(sigma_m=sigma_m, sigma_tilt_rad=tilt)
 
 
-def _bend_m(solution: Solution, agreed: Done) -> float:
-    """1-sigma of the elevation by the poses, as neighbouring images share it; 0 where nothing tells."""
+def _bend_m(solution: Solution) -> float:
+    """1-sigma of the elevation by the poses, as far as neighbouring images share it."""
     held = np.array([status == "adjusted" for status in solution.status], bool) & solution.poses.known
-    return (
-        float(np.median(solution.sigma_m[held, 2])) if held.any() and agreed.info["laser_m"] < dense.UNKNOWN_M else 0.0
-    )
+    return float(np.sqrt(_BEND) * np.median(solution.sigma_m[held, 2])) if held.any() else 0.0
+
+
+def bend_m(m: MapJob, agreed: Done) -> float:
+    """1-sigma of the elevation that all cells of a place share, m. agreed : by `dense.agreement`."""
+    return _bend_m(relative(solve.solution(m.job, m.adjusted), agreed.info["laser_m"]))
 
 
 def _soundings(X_map: np.ndarray, sigma: np.ndarray, source: int, frame: int, shared: np.ndarray) -> Soundings:
