@@ -32,11 +32,13 @@ from .factors import (
 from .motion import Motion
 from .navigation import NavigationPrior, Poses, relative, with_half_turns
 from .residuals import Residuals
+from .rotations import angle_between_deg
 
 Array = NDArray[Any]
 Status = Literal["adjusted", "navigation", "rejected: no link to the placed images"]
 
 _TURN = np.radians(2.0)
+_FAR_DEG = 5.0
 _FEW = 1 / 500  # of all images: for so few that pairs found later would join, not all are adjusted again
 # what calibration and the pinhole leave in a pair motion, whatever its matches say: 0.01 degree and 1 mm
 _LINK_FLOOR = np.diag([np.radians(0.01)] * 3 + [1e-3] * 3) ** 2
@@ -125,14 +127,16 @@ def adjust(
     )
 
 
-def would_change(links: list[Link], poses: Poses, status: Sequence[str], navigation: NavigationPrior) -> bool:
+def would_change(
+    links: list[Link], poses: Poses, status: Sequence[str], navigation: NavigationPrior, far_m: float
+) -> bool:
     """Whether links that came after the adjustment would change it.
 
     They would where they join images that only navigation places, more than a few of them, or where most of an image's,
     and two at least, contradict its pose: one alone is rather a wrong match, for what lies elsewhere overlaps several
-    images there.
+    images there. A contradiction is more than what a few matches across a narrow strip are off by.
 
-    poses, status : of the adjustment.
+    poses, status : of the adjustment. far_m : so far off, or turned by so much, is an image that lies elsewhere.
     """
     adjusted = navigation._replace(poses=poses)
     joined = {k for link in links for k in (link.i, link.j) if status[k] == "navigation"}
@@ -141,8 +145,11 @@ def would_change(links: list[Link], poses: Poses, status: Sequence[str], navigat
     told, contradicting = np.zeros((2, len(status)), int)
     for link in links:
         between = camera_pose(poses, link.i).between(camera_pose(poses, link.j))
+        motion = _scaled_by_navigation(link, adjusted).motion
+        off = float(np.linalg.norm(motion.t_i_j - between.translation()))
+        elsewhere = off > far_m or angle_between_deg(motion.R_i_j, between.rotation().matrix()) > _FAR_DEG
         told[[link.i, link.j]] += 1
-        contradicting[[link.i, link.j]] += not _consistent(_scaled_by_navigation(link, adjusted).motion, between)
+        contradicting[[link.i, link.j]] += elsewhere and not _consistent(motion, between)
     return bool(((contradicting > 1) & (2 * contradicting > told)).any())
 
 

@@ -60,10 +60,11 @@ class _Found(NamedTuple):
     uneven: Array
 
 
-def matched(grid: Grid, cells: Cells) -> Cells:
+def matched(grid: Grid, cells: Cells, window_m: float = 0.0) -> Cells:
     """Cells with matched ones smoothed and carried to their centres; those of the laser as they are.
 
-    A cell depends on those within four cells of it and on nothing else.
+    A cell depends on those within four cells of it and on nothing else. Cells in one window of matching, window_m
+    wide, share its noise: as many of them as it has are averaged as if they were one.
     """
     wanted = np.flatnonzero(cells.source == MATCHING)
     if not len(wanted):
@@ -85,7 +86,8 @@ def matched(grid: Grid, cells: Cells) -> Cells:
     at, own = wanted[found.at_centre], cells.noise.ravel()[wanted]
     elevation.ravel()[wanted] = found.elevation
     # what neighbours differ by, beyond what noise makes them, no plane explains: edges, flanks, wrong matches
-    noise.ravel()[wanted] = np.where(found.at_centre, found.noise, own) * found.uneven
+    averaged = np.maximum(found.noise, np.minimum(found.noise * max(1.0, window_m / grid.cell_m), own))
+    noise.ravel()[wanted] = np.where(found.at_centre, averaged, own) * found.uneven
     shared = np.maximum(cells.sigma.ravel()[wanted] ** 2 - own**2, 0)
     sigma.ravel()[wanted] = np.sqrt(shared + noise.ravel()[wanted] ** 2)
     x.ravel()[at], y.ravel()[at] = X.ravel()[at], Y.ravel()[at]

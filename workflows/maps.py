@@ -29,7 +29,7 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
     """Soundings, tie points and dense matching of a tile, gridded. agreed : by `dense.agreement`."""
     solution = relative(solve.solution(m.job, m.adjusted), agreed.info["laser_m"])
     # what was found and not from what: another image elsewhere is no reason to make this tile anew
-    said = [agreed.info[name] for name in ("dense_px", "tie_px")] + [round(_bend_m(solution), 4)]
+    said = [agreed.info[name] for name in ("dense_px", "tie_px", "window_m")] + [round(_bend_m(solution), 4)]
     inputs = [f"{image.row}:{image.key}" for image in tile.images] + [pose_digest(solution, rows_of(tile))]
     inputs += [f"{pair.i}-{pair.j}:{pair.ties}:{pair.dense}" for pair in tile.pairs]
 
@@ -45,7 +45,7 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
         cells = cells._replace(sigma=np.hypot(cells.sigma, said[-1]))
         at = np.flatnonzero(cells.density)
         sounded = {name: values.ravel()[at] for name, values in cells._asdict().items()}
-        return Made({"cell": at.astype(np.int32), **sounded}, {"sounded": len(at)})
+        return Made({"cell": at.astype(np.int32), **sounded}, {"sounded": len(at), "window_m": agreed.info["window_m"]})
 
     return once(m.job, CELLS, _VERSION, inputs, [context(m, tile), said], make)
 
@@ -232,7 +232,7 @@ def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]]) -> Cells:
         here = (row >= 0) & (row < grid.height) & (column >= 0) & (column < grid.width)
         for name, values in empty._asdict().items():
             values[row[here], column[here]] = arrays[name][here]
-    return smooth.matched(grid, empty)
+    return smooth.matched(grid, empty, max((done.info["window_m"] for _, done in tiles), default=0.0))
 
 
 def paste(grid: Grid, values: np.ndarray, tile: Grid, part: np.ndarray) -> None:

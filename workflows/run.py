@@ -291,8 +291,10 @@ def _close_loops(
         matched = [pair for pair in matched if pair[:2] not in tried] + again
         linked = sum(bool(done.info["model"]) for _, _, done in again)
         log.info("mission=%s step=%s later_pairs=%d linked=%d", job.mission_id, match.STEP, len(again), linked)
-        if made.prior is not None and not solve.would_change(job, adjustments[-1], again, made.prior):
-            break
+        if made.prior is not None:
+            typical = float(np.median(ranges))
+            if not solve.would_change(job, adjustments[-1], again, made.prior, typical):
+                break
         whole = [
             delayed(value, name=state.key(f"{name}-{turn}"), traverse=False)
             for name, value in (("matched", matched), ("extracted", list(extracts)))

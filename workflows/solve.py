@@ -16,6 +16,7 @@ from . import extract, match
 from .job import Done, Job, Made, code_version, load, once, read, rounded_digest, stage
 
 STEP = "adjust"
+_ELSEWHERE = 0.1  # of the range
 VERSION = code_version(sys.modules[__name__])
 
 
@@ -89,11 +90,13 @@ def _links(job: Job, linked: Sequence[tuple[int, int, Done]]) -> list[Link]:
     return [match.link(i, j, load(job, match.STEP, done.key, names)) for i, j, done in linked]
 
 
-def would_change(job: Job, made: Done, later: Sequence[tuple[int, int, Done]], prior: NavigationPrior) -> bool:
+def would_change(
+    job: Job, made: Done, later: Sequence[tuple[int, int, Done]], prior: NavigationPrior, range_m: float
+) -> bool:
     """Whether pairs matched after an adjustment would change it; see `tasks.adjust.would_change`."""
     found = solution(job, made.key)
     links = _links(job, [pair for pair in later if pair[2].info["model"]])
-    return adjust.would_change(links, found.poses, found.status, prior)
+    return adjust.would_change(links, found.poses, found.status, prior, _ELSEWHERE * range_m)
 
 
 def _bundle(

@@ -199,11 +199,13 @@ def test_later_links_tell_anew_what_they_contradict_or_join(metric):
     found = _run(poses, [link for link in links if link not in later], navigation)
 
     def anew(links, poses=found.poses, status=found.status):
-        return adjust.would_change(links, poses, status, navigation)
+        return adjust.would_change(links, poses, status, navigation, 0.3)
 
     assert not anew(later)
     wrong = Link(3, 14, _motion(np.eye(3), np.array([0.4, 0.4, 0.0]) / (1 if metric else 0.566), metric))
     assert not anew([*later, wrong])
     moved = found.poses._replace(C_local=found.poses.C_local + np.where(np.arange(24) < 12, 0.0, 0.5)[:, None])
     assert anew(links, moved)
+    nudged = found.poses._replace(C_local=found.poses.C_local + np.where(np.arange(24) < 12, 0.0, 0.1)[:, None])
+    assert not anew(links, nudged)  # what is off by so little is no jump
     assert anew(later, status=["navigation" if k == later[0].i else one for k, one in enumerate(found.status)])

@@ -1,6 +1,7 @@
 """Matched cells averaged over planes: noise goes, edges stay."""
 
 import numpy as np
+import pytest
 from seamosaic.tasks import gridding, grids, smooth
 from seamosaic.tasks.grids import Grid
 
@@ -34,6 +35,21 @@ def test_even_ground_loses_its_noise_and_says_so():
     # what neighbours share does not average down
     assert np.median(after.sigma) > 0.001
     assert 0.97 < np.mean(np.abs(after.x - X)[5:-5, 5:-5] < 1e-9) <= 1
+
+
+@pytest.mark.parametrize("width", [1, 3])
+def test_cells_that_share_their_noise_are_not_averaged_as_if_they_did_not(width):
+    """Noise that is the same over squares of some cells, as it is in one window of matching."""
+    before = _cells(np.full(GRID.shape, -10.0), 0.0)._replace(noise=np.full(GRID.shape, 0.002))
+    rng = np.random.default_rng(3)
+    errors, stated = [], []
+    for _ in range(20):
+        coarse = rng.normal(0, 0.002, (GRID.height // width + 1, GRID.width // width + 1))
+        shared = np.kron(coarse, np.ones((width, width)))[: GRID.height, : GRID.width]
+        after = smooth.matched(GRID, before._replace(elevation=-10 + shared), width * GRID.cell_m)
+        errors.append(after.elevation[8:-8, 8:-8] + 10)
+        stated.append(after.noise[8:-8, 8:-8])
+    assert 0.8 < np.std(errors) / np.sqrt(np.mean(np.square(stated))) < 1.3
 
 
 def test_an_edge_stays_where_it_is():
