@@ -80,9 +80,10 @@ def check(url: str, parameters: Parameters) -> CheckResult:
             )
         except InvalidInput as invalid:
             return CheckResult(url, opened, invalid.problems, tuple(opened.warnings), ())
-    warnings = list(opened.warnings)
+    warnings = opened.warnings
     if seen is not None and opened.calibration.laser is not None:
-        warnings += filter(None, [plan.beyond_the_laser(parameters, seen.altitude_m)])
+        height = plan.beyond_the_laser(parameters, seen.altitude_m)
+        warnings = [*warnings, height] if height else warnings
     return CheckResult(url, opened, (), tuple(warnings), tuple(_plan(opened, parameters, seen)))
 
 
@@ -126,7 +127,8 @@ def _plan(opened: OpenedMission, parameters: Parameters, seen: Coverage | None) 
         *_cells(seen, parameters),
     ]
     if seen is not None:
-        found = memory_need.needs(opened.calibration.camera, parameters, int(counts.sum()), seen.altitude_m)
+        largest = int(frames["size"].max())
+        found = memory_need.needs(opened.calibration.camera, parameters, int(counts.sum()), seen.altitude_m, largest)
         most = max(found)
         lines.append(("memory", f"{most.size / memory_need.GIB:.1f} GiB a worker, most of all for {most.what}"))
     return lines

@@ -23,7 +23,7 @@ _DEPTH_MARGIN = 0.08  # of the depth
 _IMAGES_KEPT = 4
 _WITHIN_CELLS = 0.5
 # where no laser tells: half a pixel of dense matching, which is on smaller images, and one of tie points
-_DENSE_PX, _TIE_PX, UNKNOWN_M = 0.5, 1.0, 1.0
+_DENSE_PX, _TIE_PX, _UNKNOWN_M = 0.5, 1.0, 1.0
 
 
 class DensePair(NamedTuple):
@@ -143,7 +143,7 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
     """How well matching agrees with the laser over some pairs.
 
     The info has the 1-sigma of dense matching and tie points in pixels of disparity, dense_px and tie_px, and that of
-    the laser's elevations by its images' poses, laser_m (UNKNOWN_M where nothing tells); and how wide the windows of
+    the laser's elevations by its images' poses, laser_m (_UNKNOWN_M where nothing tells); and how wide the windows of
     dense matching are on the ground, window_m (0 without).
 
     pairs : each with the key of its dense matching, "" without, and the images that touch it.
@@ -169,7 +169,7 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
             "dense_px": dense_cells.share_of_each(dense_px, _DENSE_PX),
             "tie_px": dense_cells.share_of_each(tie_px, _TIE_PX),
             "window_m": float(np.median(windows[1:] or windows)),
-            "laser_m": dense_cells.share_of_each(dense_m if dense_cells.tell(dense_m) else tie_m, UNKNOWN_M),
+            "laser_m": dense_cells.share_of_each(dense_m if dense_cells.tell(dense_m) else tie_m, _UNKNOWN_M),
         }
         return Made({}, {name: round(value, 4) for name, value in found.items()})
 

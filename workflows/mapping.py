@@ -353,21 +353,17 @@ def _mosaics(
         state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name=state.key("align"))]
     )
     footprints, placed = _Footprints(outlines, shown, aligned.info["moved_m"]), _Placed(ground.tiles)
-    tiles = [tile for tile in grids.tiles(grid, state.job.parameters.mosaic.tile_cells) if footprints.touching(tile)]
-    tasks = []
-    for k, tile in enumerate(tiles):
-        described = Tile(tile, footprints.touching(tile))
-        around = maps.ground_around(tile, ground.grid.cell_m, m.max_interpolation_m)
-        near = placed.overlapping(around)
-        tasks.append(
-            delayed(mosaics.mosaic_tile)(
-                m, described, near, aligned._replace(info={}), light, dask_key_name=state.key("mosaic", k)
-            )
-        )
+    tiles = grids.tiles(grid, state.job.parameters.mosaic.tile_cells)
+    seen = [Tile(tile, touching) for tile in tiles if (touching := footprints.touching(tile))]
+    key_alone, tasks = aligned._replace(info={}), []  # its info is of all images
+    for k, tile in enumerate(seen):
+        near = placed.overlapping(maps.ground_around(tile.grid, m.cell_m, m.max_interpolation_m))
+        given = (m, tile, near, key_alone, light)
+        tasks.append(delayed(mosaics.mosaic_tile)(*given, dask_key_name=state.key("mosaic", k)))
     done: list[Done] = compute(state, mosaics.MOSAIC, tasks)
     for step, results in ((mosaics.ALIGN, [aligned]), (mosaics.MOSAIC, done)):
         state.ledger.end(step, results)
-    return Tiles(grid, tuple(zip(tiles, done, strict=True)))
+    return Tiles(grid, tuple((tile.grid, one) for tile, one in zip(seen, done, strict=True)))
 
 
 def _mesh(

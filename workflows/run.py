@@ -295,11 +295,9 @@ def _close_loops(
             typical = float(np.median(ranges))
             if not solve.would_change(job, adjustments[-1], again, made.prior, typical):
                 break
-        whole = [
-            delayed(value, name=state.key(f"{name}-{turn}"), traverse=False)
-            for name, value in (("matched", matched), ("extracted", list(extracts)))
-        ]
-        adjustments += compute(state, "adjust", [_adjust_task(state, [whole[0]], whole[1], f"adjust-{turn}")])
+        pairs = delayed(matched, name=state.key(f"matched-{turn}"), traverse=False)
+        images = delayed(list(extracts), name=state.key(f"extracted-{turn}"), traverse=False)
+        adjustments += compute(state, "adjust", [_adjust_task(state, [pairs], images, f"adjust-{turn}")])
     return matched
 
 
