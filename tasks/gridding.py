@@ -84,6 +84,14 @@ def grid_soundings(grid: Grid, soundings: Soundings) -> Cells:
     return _means(grid, placed.take(~_outliers(placed)))
 
 
+def beside_laser(grid: Grid, soundings: Soundings) -> Cells:
+    """What image matching says of the cells that the laser has seen, of which `grid_soundings` tells the laser's."""
+    row, column = index_of(grid, soundings.X)
+    cell, laser = np.where(inside(grid, row, column), row * grid.width + column, -1), soundings.source == LASER
+    lit = ~laser & np.isin(cell, cell[laser])
+    return grid_soundings(grid, Soundings._make(values[lit] for values in soundings))
+
+
 def _sorted(grid: Grid, soundings: Soundings) -> _Sorted:
     row, column = index_of(grid, soundings.X)
     usable = inside(grid, row, column) & np.isfinite(soundings.X).all(1) & (soundings.sigma > 0)

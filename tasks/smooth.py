@@ -1,12 +1,15 @@
 """Cells of image matching, each averaged with as many of its neighbours as lie on one plane with it.
 
 Local planes over growing squares; the largest that says the same as all smaller ones, within what their noise allows,
-counts (intersection of confidence intervals: Katkovnik 1999). On even ground that takes the noise of matching away; on
-rough ground and at edges cells stay as they are.
+counts (intersection of confidence intervals: Katkovnik 1999). The seabed departs from its planes by as much as cells
+around do beyond their noise, so a cell is taken to lie between the plane and its own value, by what either is worth
+(best linear unbiased prediction: universal kriging with a nugget, Cressie 1993). On even ground that takes the noise of
+matching away; on rough ground and at edges cells stay as they are.
 """
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +27,11 @@ _LEAST_CELLS = 6
 _TOGETHER = 32_768  # cells, whose sums stay in the processor's cache
 _SPIKE_CELLS = 5  # neighbours that can tell a cell that it stands out
 _CHANCE = 3.0  # sigmas of chi squared over its freedom: more is no plane
+_ROUGH_RADIUS = 5  # cells, of the square whose planes tell how rough the ground is
+_EVEN = 1.16  # chi squared over its freedom of all of them, a sigma above what even ground has
+_MOST_MISFIT = 9.0  # of one plane's chi squared over its freedom that counts: more is an edge
+_WHOLE = 1e-12  # m2; sums of whole numbers are the same in whatever order
+REACH = _RADII[-1] + _ROUGH_RADIUS + _RADII[0]  # cells, of what a cell depends on
 
 
 class _Moments(NamedTuple):
@@ -42,13 +50,16 @@ class _Moments(NamedTuple):
 
 
 class _Around(NamedTuple):
-    """All cells with a rim of unknown ones, flat, in rows of `width`: x, y from their centres, cells; weights; z."""
+    """All cells with a rim of unknown ones, flat, in rows of `width`: x, y from their centres, cells; weights; z;
+    variances of their noise, and of how far the ground departs from its planes, in units of _NOISE_M squared."""
 
     width: int
     x: Array
     y: Array
     weight: Array
     z: Array
+    noise: Array
+    rough: Array
 
 
 class _Found(NamedTuple):
@@ -60,11 +71,12 @@ class _Found(NamedTuple):
     uneven: Array
 
 
-def matched(grid: Grid, cells: Cells, window_m: float = 0.0) -> Cells:
+def matched(grid: Grid, cells: Cells, noise_scale: float = 1.0) -> Cells:
     """Cells with matched ones smoothed and carried to their centres; those of the laser as they are.
 
-    A cell depends on those within four cells of it and on nothing else. Cells in one window of matching, window_m
-    wide, share its noise: as many of them as it has are averaged as if they were one.
+    A cell depends on those within `REACH` cells of it and on nothing else.
+
+    noise_scale : what matched cells err by, their noise by the images being 1, as `matching_noise` finds it.
     """
     wanted = np.flatnonzero(cells.source == MATCHING)
     if not len(wanted):
@@ -72,12 +84,17 @@ def matched(grid: Grid, cells: Cells, window_m: float = 0.0) -> Cells:
     X, Y = cell_centres(grid)
     x, y = (cells.x - X) / grid.cell_m, (cells.y - Y) / grid.cell_m
     z = np.where(cells.source == MATCHING, _without_spikes(cells.elevation), cells.elevation)
-    weight = np.where(cells.density > 0, (_NOISE_M / np.maximum(cells.noise, 1e-5)) ** 2, 0.0)
+    noise = np.where(cells.density > 0, (np.maximum(cells.noise, 1e-5) / _NOISE_M) ** 2, np.inf)
     rim = _RADII[-1]
-    u, v, w, heights = (np.pad(np.nan_to_num(values), rim).ravel() for values in (x, y, weight, z))
-    u, v, w = (values.astype(np.float32) for values in (u, v, w))
-    around = _Around(grid.width + 2 * rim, u, v, w, heights)
-    here = (wanted // grid.width + rim) * around.width + wanted % grid.width + rim
+    u, v, heights = (np.pad(np.nan_to_num(values), rim).ravel() for values in (x, y, z))
+    variance = np.pad(noise, rim, constant_values=np.inf).ravel().astype(np.float32)
+    width = grid.width + 2 * rim
+    around = _Around(
+        width, u.astype(np.float32), v.astype(np.float32), 1 / variance, heights, variance, np.zeros_like(variance)
+    )
+    here = (wanted // grid.width + rim) * width + wanted % grid.width + rim
+    rough = np.pad(_roughness(grid, around, wanted, here), rim).ravel().astype(np.float32)
+    around = around._replace(weight=1 / (variance + rough), rough=rough)
     parts = [_smoothed(around, here[k : k + _TOGETHER]) for k in range(0, len(here), _TOGETHER)]
     found = _Found(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     elevation, sigma, noise, x, y = (
@@ -86,30 +103,58 @@ def matched(grid: Grid, cells: Cells, window_m: float = 0.0) -> Cells:
     at, own = wanted[found.at_centre], cells.noise.ravel()[wanted]
     elevation.ravel()[wanted] = found.elevation
     # what neighbours differ by, beyond what noise makes them, no plane explains: edges, flanks, wrong matches
-    averaged = np.maximum(found.noise, np.minimum(found.noise * max(1.0, window_m / grid.cell_m), own))
-    noise.ravel()[wanted] = np.where(found.at_centre, averaged, own) * found.uneven
+    noise.ravel()[wanted] = noise_scale * np.where(found.at_centre, found.noise, own) * found.uneven
     shared = np.maximum(cells.sigma.ravel()[wanted] ** 2 - own**2, 0)
     sigma.ravel()[wanted] = np.sqrt(shared + noise.ravel()[wanted] ** 2)
     x.ravel()[at], y.ravel()[at] = X.ravel()[at], Y.ravel()[at]
     return cells._replace(elevation=elevation, sigma=sigma, noise=noise, x=x, y=y)
 
 
+def _roughness(grid: Grid, around: _Around, wanted: NDArray[np.int64], here: NDArray[np.int64]) -> Array:
+    """Variance (height, width) of how far the ground departs from the planes through nine cells.
+
+    What is left of the planes around each matched cell beyond their noise, all together; units of `_Around`.
+    """
+    excess, freedom = np.zeros(grid.shape), np.zeros(grid.shape)
+    for k in range(0, len(here), _TOGETHER):
+        some, cell = here[k : k + _TOGETHER], wanted[k : k + _TOGETHER]
+        sums, count = _nothing(len(some))
+        _add_ring(sums, count, (0, _RADII[0]), around, some)
+        _, variance, misfit = _plane(sums, count)
+        told = (count >= _LEAST_CELLS) & (variance > 0)
+        free = np.where(told, count - 3, 0)
+        more = (np.clip(np.where(told, misfit, 0), 0, _MOST_MISFIT) - _EVEN) * free * count / np.maximum(sums.one, 1e-9)
+        excess.ravel()[cell], freedom.ravel()[cell] = np.round(more * (_NOISE_M**2 / _WHOLE)), free
+    size = (2 * _ROUGH_RADIUS + 1,) * 2
+    total, free = (
+        cv2.boxFilter(values, cv2.CV_64F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for values in (excess, freedom)
+    )
+    return np.maximum(total, 0) / np.maximum(free, 1) * (_WHOLE / _NOISE_M**2)
+
+
+def _nothing(count: int) -> tuple[_Moments, Array]:
+    return _Moments(*(np.zeros(count, np.float32) for _ in _Moments._fields)), np.zeros(count, np.float32)
+
+
 def _smoothed(around: _Around, here: NDArray[np.int64]) -> _Found:
     """The cells at some places among all, each by the largest plane that says the same as all smaller ones."""
-    z, count = around.z[here], np.zeros(len(here), np.float32)
+    z, own, rough = (values[here].astype(float) for values in (around.z, around.noise, around.rough))
+    kept = rough / (rough + own)  # how much of a cell's departure from its plane is the seabed's
     found, noise, uneven = z.copy(), np.zeros(len(here)), np.ones(len(here))
     low, high = np.full(len(here), -np.inf), np.full(len(here), np.inf)
     going, at_centre, last = np.ones(len(here), bool), np.zeros(len(here), bool), 0
-    sums = _Moments(*(np.zeros(len(here), np.float32) for _ in _Moments._fields))
+    sums, count = _nothing(len(here))
     for radius in _RADII:
         _add_ring(sums, count, (last, radius), around, here)
         last = radius
-        height, variance, misfit = _plane(sums, count)
+        plane, variance, misfit = _plane(sums, count)
         if radius == _RADII[0]:
             uneven = np.sqrt(np.where((count >= _LEAST_CELLS) & (misfit > _most(count)), misfit, 1))
-        enough = going & (count >= _LEAST_CELLS) & np.isfinite(height) & (variance > 0)
-        height = np.where(enough, height, 0.0)
-        spread = _INTERVAL * np.sqrt(np.where(enough, variance, 0))
+        enough = going & (count >= _LEAST_CELLS) & np.isfinite(plane) & (variance > 0)
+        height = (1 - kept) * np.where(enough, plane, 0)
+        variance = kept * own * _NOISE_M**2 + (1 - kept) ** 2 * np.where(enough, variance, 0)
+        spread = _INTERVAL * np.sqrt(variance)
         low, high = (
             np.where(enough, np.maximum(low, height - spread), low),
             np.where(enough, np.minimum(high, height + spread), high),

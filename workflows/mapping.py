@@ -19,6 +19,7 @@ from .solve import Solution
 _LIGHTING_IMAGES = 200
 _GROWTH_CELLS = 6 * 512 * 512
 _RELIEF_SHARE = 0.3
+_HIDING = 0.5  # of the range: terrain of two thirds of it hides what is so far behind it from an image's corner
 _WORST_SIGMA = 1 / 75  # of the range: what interpolation knows less of it does not know
 _LEAST_SEEN = 0.91  # of the ground that images see: where that is mapped, what is less certain stays empty
 _TIES_A_BATCH, _PAIRS_A_BATCH = 64, 8
@@ -44,7 +45,8 @@ def map_tiles(state: Session, posed: Posed) -> Mapped:
     reach = grids.max_interpolation_m(typical) if across == "auto" else float(across)
     worst = typical * _WORST_SIGMA if p.grid.max_sigma_m == "auto" else float(p.grid.max_sigma_m)
     enough = _LEAST_SEEN if p.grid.max_sigma_m == "auto" else 1.0
-    m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst, enough)
+    hiding = float(np.ceil(_HIDING * typical))  # whole metres: one more image does not change it
+    m = MapJob(job, state.plan.frame, posed.adjusted.key, cell, reach, worst, hiding, enough)
     outlines = _outlines(state, posed.solution, ranges)
     # what is costly does not change with the bathymetry's cell: matching is kept as fine as either of the cells,
     # mosaics and mesh lie on a surface of the usual ones, and coarser ones are made of it
@@ -357,7 +359,7 @@ def _mosaics(
     seen = [Tile(tile, touching) for tile in tiles if (touching := footprints.touching(tile))]
     key_alone, tasks = aligned._replace(info={}), []  # its info is of all images
     for k, tile in enumerate(seen):
-        near = placed.overlapping(maps.ground_around(tile.grid, m.cell_m, m.max_interpolation_m))
+        near = placed.overlapping(maps.ground_around(tile.grid, m.cell_m, m.hiding_m))
         given = (m, tile, near, key_alone, light)
         tasks.append(delayed(mosaics.mosaic_tile)(*given, dask_key_name=state.key("mosaic", k)))
     done: list[Done] = compute(state, mosaics.MOSAIC, tasks)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..tasks import coarsening, gridding, grids, smooth, surface
+from ..tasks import coarsening, gridding, grids, matching_noise, smooth, surface
 from ..tasks.gridding import LASER, MATCHING, Cells, Soundings
 from ..tasks.grids import Grid
 from ..tasks.surface import Growth
@@ -22,6 +22,7 @@ _LEAST_HALO = 6  # cells
 # have in common, as they share images and the bend of the whole, so that it does not average down
 _SHARED, _BEND = 0.5, 0.5
 _LEAST_NOISE_PX = 0.02
+_BESIDE = "beside_"  # names of what matching says of the laser's cells
 _TRUST = 2 / 3  # in what laser and matching say of each other, against what the adjustment says
 
 
@@ -29,7 +30,7 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
     """Soundings, tie points and dense matching of a tile, gridded. agreed : by `dense.agreement`."""
     solution = relative(solve.solution(m.job, m.adjusted), agreed.info["laser_m"])
     # what was found and not from what: another image elsewhere is no reason to make this tile anew
-    said = [agreed.info[name] for name in ("dense_px", "tie_px", "window_m")] + [round(_bend_m(solution), 4)]
+    said = [agreed.info[name] for name in ("dense_px", "tie_px")] + [round(_bend_m(solution), 4)]
     inputs = [f"{image.row}:{image.key}" for image in tile.images] + [pose_digest(solution, rows_of(tile))]
     inputs += [f"{pair.i}-{pair.j}:{pair.ties}:{pair.dense}" for pair in tile.pairs]
 
@@ -41,11 +42,14 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
             if pair.dense:
                 parts.append(_within(tile.grid, _dense(m, pair, count, agreed.info["dense_px"])))
         soundings = Soundings._make(np.concatenate(column) for column in zip(_NOTHING, *parts, strict=True))
-        cells = gridding.grid_soundings(tile.grid, soundings)
-        cells = cells._replace(sigma=np.hypot(cells.sigma, said[-1]))
-        at = np.flatnonzero(cells.density)
-        sounded = {name: values.ravel()[at] for name, values in cells._asdict().items()}
-        return Made({"cell": at.astype(np.int32), **sounded}, {"sounded": len(at), "window_m": agreed.info["window_m"]})
+        made = {}
+        for prefix, gridded in (("", gridding.grid_soundings), (_BESIDE, gridding.beside_laser)):
+            cells = gridded(tile.grid, soundings)
+            cells = cells._replace(sigma=np.hypot(cells.sigma, said[-1]))
+            at = np.flatnonzero(cells.density)
+            made[f"{prefix}cell"] = at.astype(np.int32)
+            made |= {f"{prefix}{name}": values.ravel()[at] for name, values in cells._asdict().items()}
+        return Made(made, {"sounded": len(made["cell"])})
 
     return once(m.job, CELLS, _VERSION, inputs, [context(m, tile), said], make)
 
@@ -136,7 +140,10 @@ class Sample(NamedTuple):
 
 
 def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
-    """How interpolation errs on this seabed, from soundings held out in some of its tiles; and which guesses to show.
+    """How matching and interpolation err on this seabed; and which guesses to show.
+
+    Matching, noise_scale of the info, where the laser has seen the same cells; interpolation by soundings held out;
+    both in some of the tiles.
 
     Interpolated cells are shown as long as they are more certain than max_sigma_m of the info: no more of them than it
     takes to map `m.least_seen` of the ground that images have seen, and none less certain than m.max_sigma_m.
@@ -145,24 +152,36 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
     def make() -> Made:
         reach = m.max_interpolation_m
         held = []
+        scale = matching_noise.noise_scale(_beside(m, samples))
         for sample in samples:  # twice over all of them, so that one is held at a time
             halo = _halo(m, sample.tile)
-            held.append(surface.hold_out(halo, _cells(m.job, halo, sample.neighbours), reach, sample.tile))
+            held.append(surface.hold_out(halo, _cells(m.job, halo, sample.neighbours, scale), reach, sample.tile))
         law = surface.fit_growth(surface.Holdout(*(np.concatenate(column) for column in zip(*held, strict=True))))
         sigma = [np.zeros(0)]
         for sample in samples:
             halo = _halo(m, sample.tile)
-            known, inner = _cells(m.job, halo, sample.neighbours), grids.window(halo, sample.tile)
+            known, inner = _cells(m.job, halo, sample.neighbours, scale), grids.window(halo, sample.tile)
             found = surface.delaunay_surface(halo, known, m.max_interpolation_m, law, sample.tile)
             seen = surface.seen(sample.tile, sample.outlines)
             sigma.append(np.where(known.density[inner] > 0, 0.0, found.sigma[inner])[seen])
         worst = surface.worst_shown(np.concatenate(sigma), m.least_seen, m.max_sigma_m)
-        return Made({}, {**law._asdict(), "max_sigma_m": worst})
+        return Made({}, {**law._asdict(), "noise_scale": round(scale, 4), "max_sigma_m": worst})
 
     inputs = [done.key for sample in samples for _, done in sample.neighbours]
     inputs.append(array_digest(*(np.round(sample.outlines, 3) for sample in samples)))
     parameters = [m.max_interpolation_m, m.max_sigma_m, m.least_seen, [list(sample.tile) for sample in samples]]
     return once(m.job, GROWTH, _VERSION, inputs, parameters, make)
+
+
+def _beside(m: MapJob, samples: Sequence[Sample]) -> matching_noise.Beside:
+    """Matched cells beside the laser's in some tiles."""
+    found = []
+    for sample in samples:
+        halo = grids.pad(sample.tile, smooth.REACH + 1)
+        cells, beside = (_gridded(m.job, halo, sample.neighbours, prefix) for prefix in ("", _BESIDE))
+        matched = smooth.matched(halo, matching_noise.instead_of_laser(cells, beside))
+        found.append(matching_noise.compare(halo, matched, cells, sample.tile))
+    return matching_noise.Beside(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
 def _halo(m: MapJob, tile: Grid) -> Grid:
@@ -172,11 +191,11 @@ def _halo(m: MapJob, tile: Grid) -> Grid:
 def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]], growth: Done) -> Done:
     """The Delaunay surface of a tile from the cells of the tiles around it."""
     law, worst = Growth(*(growth.info[name] for name in Growth._fields)), growth.info["max_sigma_m"]
-    inputs = [done.key for _, done in neighbours]
+    inputs, scale = [done.key for _, done in neighbours], growth.info["noise_scale"]
 
     def make() -> Made:
         halo = _halo(m, tile)
-        cells = _cells(m.job, halo, neighbours)
+        cells = _cells(m.job, halo, neighbours, scale)
         found = surface.delaunay_surface(halo, cells, m.max_interpolation_m, law, tile)
         mapped = surface.without_guesses(found, worst)
         inner = grids.window(halo, tile)
@@ -191,7 +210,7 @@ def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]],
         cut = {name: values[inner] for name, values in layers.items()}
         return Made(cut, {"cells": int(np.isfinite(cut["elevation"]).sum()), "max_sigma_m": worst})
 
-    parameters = [list(tile), m.max_interpolation_m, worst, list(law)]
+    parameters = [list(tile), m.max_interpolation_m, worst, list(law), scale]
     return once(m.job, SURFACE, _VERSION, inputs, parameters, make, compress=True)
 
 
@@ -215,7 +234,12 @@ def coarse_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]]) 
     return once(m.job, SURFACE, _VERSION, inputs, [list(tile), worst], make, compress=True)
 
 
-def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]]) -> Cells:
+def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]], noise_scale: float) -> Cells:
+    return smooth.matched(grid, _gridded(job, grid, tiles), noise_scale)
+
+
+def _gridded(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]], prefix: str = "") -> Cells:
+    """The cells of some tiles on a grid over them; with `_BESIDE` what matching says of those of the laser."""
     empty = Cells(
         elevation=np.full(grid.shape, np.nan),
         sigma=np.full(grid.shape, np.nan),
@@ -226,13 +250,13 @@ def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]]) -> Cells:
         y=np.full(grid.shape, np.nan),
     )
     for tile, done in tiles:
-        arrays = load(job, CELLS, done.key).arrays
-        row, column = np.divmod(arrays["cell"], tile.width)
+        arrays = load(job, CELLS, done.key, [f"{prefix}{name}" for name in ("cell", *Cells._fields)]).arrays
+        row, column = np.divmod(arrays[f"{prefix}cell"], tile.width)
         row, column = row + grid.top - tile.top, column + tile.left - grid.left
         here = (row >= 0) & (row < grid.height) & (column >= 0) & (column < grid.width)
         for name, values in empty._asdict().items():
-            values[row[here], column[here]] = arrays[name][here]
-    return smooth.matched(grid, empty, max((done.info["window_m"] for _, done in tiles), default=0.0))
+            values[row[here], column[here]] = arrays[f"{prefix}{name}"][here]
+    return empty
 
 
 def paste(grid: Grid, values: np.ndarray, tile: Grid, part: np.ndarray) -> None:
@@ -243,9 +267,9 @@ def paste(grid: Grid, values: np.ndarray, tile: Grid, part: np.ndarray) -> None:
     values[grids.window(grid, shared)] = part[grids.window(tile, shared)]
 
 
-def ground_around(tile: Grid, cell_m: float, max_interpolation_m: float) -> Grid:
+def ground_around(tile: Grid, cell_m: float, hiding_m: float) -> Grid:
     """The bathymetry that a mosaic tile needs: its own ground, and as far around as terrain may hide it."""
-    return grids.pad(grids.grid_around(tile.bounds, cell_m), max(_LEAST_HALO, round(max_interpolation_m / cell_m)))
+    return grids.pad(grids.grid_around(tile.bounds, cell_m), max(_LEAST_HALO, round(hiding_m / cell_m)))
 
 
 VERSIONS = dict.fromkeys((CELLS, GROWTH, SURFACE), _VERSION)

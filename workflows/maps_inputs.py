@@ -51,6 +51,7 @@ class MapJob(NamedTuple):
     ----------
     frame : local and map. adjusted : key of the poses. cell_m : of the bathymetry.
     max_interpolation_m, max_sigma_m : how far from soundings, and how uncertain, interpolated cells may be.
+    hiding_m : how far away terrain may hide a place from a camera.
     least_seen : share of the ground seen beyond which no guesses are shown.
     """
 
@@ -60,6 +61,7 @@ class MapJob(NamedTuple):
     cell_m: float
     max_interpolation_m: float
     max_sigma_m: float
+    hiding_m: float
     least_seen: float
 
 

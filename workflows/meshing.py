@@ -57,7 +57,7 @@ def leaf_inputs(m: MapJob, place: Place, mosaic_cell_m: float) -> tuple[Grid, Gr
     """The nodes of a leaf, the bathymetry that it needs, and the mosaic pixels that it needs."""
     own = mesh.leaf_grid(place.column, place.row, m.cell_m)
     texture = grids.pad(grids.grid_around(own.bounds, mosaic_cell_m), 1)
-    return own, ground_around(own, m.cell_m, m.max_interpolation_m), texture
+    return own, ground_around(own, m.cell_m, m.hiding_m), texture
 
 
 def leaf(
@@ -91,7 +91,8 @@ def leaf(
         steep = _Steep(m, images, solution.poses, light, relief, mosaic_cell_m)
         return _made(place, z[inner], slopes, made, ortho, made.error_m, steep)
 
-    parameters = [list(place), list(own), mosaic_cell_m, *context(m, tile), *stage(m.job.parameters.mosaic)]
+    place_of = [list(place), list(own), m.hiding_m, *context(m, tile)]
+    parameters = [*place_of, mosaic_cell_m, *stage(m.job.parameters.mosaic)]
     return once(m.job, MESH, _VERSION, inputs, parameters, make, ("z", "slopes", "nodes", "heights", "triangles", "uv"))
 
 

@@ -57,7 +57,7 @@ def _inputs(tile: Tile, solution: Solution) -> list[str]:
 
 
 def _context(m: MapJob, tile: Tile) -> list[Any]:
-    return [*context(m, tile), m.max_interpolation_m, *stage(m.job.parameters.mosaic)]
+    return [*context(m, tile), m.hiding_m, *stage(m.job.parameters.mosaic)]
 
 
 def align_planar(m: MapJob, images: Sequence[Image], linked: Sequence[Pair]) -> Done:
@@ -148,7 +148,7 @@ def _on_surface(
     m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], poses: Poses
 ) -> tuple[nodes.Ground, dict[int, Lie]]:
     """The tile's nodes on the surface, and how its images lie to them."""
-    around = ground_around(tile.grid, m.cell_m, m.max_interpolation_m)
+    around = ground_around(tile.grid, m.cell_m, m.hiding_m)
     elevation = np.full(around.shape, np.nan)
     for grid, done in ground:
         paste(around, elevation, grid, load(m.job, SURFACE, done.key, ("ground",)).arrays["ground"])

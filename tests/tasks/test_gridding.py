@@ -87,6 +87,27 @@ def test_laser_decides_where_it_is():
     assert np.abs(cells.elevation[:, 10:] + 11.7).max() < 0.01
 
 
+def test_what_matching_says_of_the_lasers_cells_is_kept_beside():
+    rng = np.random.default_rng(6)
+    laser = soundings(rng, 900, noise=0.001)
+    laser = laser[laser[:, 0] < GRID.bounds[0] + 1.5]
+    matched = soundings(rng, 3000, z=lambda x, y: 0 * x - 11.9, noise=0.001)
+    source = np.repeat([1, 2], [len(laser), len(matched)])
+    both = gridding.Soundings(
+        np.concatenate([laser, matched]),
+        np.full(len(source), 0.001),
+        source.astype(np.uint8),
+        source.astype(np.int64),
+        np.zeros(len(source)),
+        np.zeros(len(source), bool),
+    )
+    cells, beside = gridding.grid_soundings(GRID, both), gridding.beside_laser(GRID, both)
+    np.testing.assert_array_equal(beside.density > 0, (cells.source == 1) & (gridded(matched).density > 0))
+    assert (beside.source[beside.density > 0] == 2).all()
+    np.testing.assert_allclose(beside.elevation[beside.density > 0], -11.9, atol=0.006)
+    np.testing.assert_allclose(cells.elevation[beside.density > 0], -12, atol=0.006)
+
+
 def test_empty_cells_are_empty_and_positions_are_means():
     X = np.array(
         [[500000.01, 4699999.99, -5.0], [500000.03, 4699999.95, -5.2], [0.0, 0.0, 0.0], [500000.5, 4699999.5, np.nan]]

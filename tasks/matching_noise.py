@@ -1,0 +1,78 @@
+"""What matched cells err by, measured where the laser has seen the same cells.
+
+The noise of the images says what a pair errs by on a plane; that windows of matching round off what is rough and that
+neighbours share them, it does not say. So cells of matching are compared with the laser's, which is finer.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .gridding import LASER, MATCHING, Cells, group_index, group_median
+from .grids import Grid, window
+
+Array = NDArray[np.float64]
+
+_BLOCK_CELLS, _LEAST_IN_BLOCK = 25, 12  # poses move matching against the laser by decimetres of ground at a time
+_LEAST_COMPARED = 100
+_USUAL = 1.5  # where the laser says too little: of simulated surveys, 1.1 on even ground to 1.8 on rough
+_JUDGE = 1.0  # of a cell's noise: where the laser's own is more, it tells nothing
+_ONE_SIGMA, _TWO_SIGMA = 0.6827, 0.9545
+
+
+class Beside(NamedTuple):
+    """Cells of matching beside the laser's; (K,) m.
+
+    Attributes
+    ----------
+    error : of the elevation, without what poses do to the place.
+    noise, laser : stated 1-sigma of the cell's noise, and of the laser's.
+    """
+
+    error: Array
+    noise: Array
+    laser: Array
+
+
+def instead_of_laser(cells: Cells, beside: Cells) -> Cells:
+    """The cells as matching alone would have them wherever it has something to say (`gridding.beside_laser`)."""
+    known = beside.source == MATCHING
+    return Cells(*(np.where(known, theirs, mine) for mine, theirs in zip(cells, beside, strict=True)))
+
+
+def compare(grid: Grid, matched: Cells, cells: Cells, counted: Grid) -> Beside:
+    """Matched cells, by `instead_of_laser` and `smooth.matched`, beside those of the laser.
+
+    counted : the part of the grid whose cells count.
+    """
+    inner = window(grid, counted)
+    both = np.zeros(grid.shape, bool)
+    both[inner] = ((cells.source == LASER) & (matched.source == MATCHING))[inner]
+    south, east = np.gradient(matched.elevation, grid.cell_m) if min(grid.shape) > 1 else np.full((2, *grid.shape), 0.0)
+    # both are where their soundings lie on average, which is not the same place
+    off = matched.elevation - cells.elevation - east * (matched.x - cells.x) + south * (matched.y - cells.y)
+    row, column = np.nonzero(both & np.isfinite(off) & (cells.noise < _JUDGE * matched.noise))
+    place = np.column_stack([(grid.top - row) // _BLOCK_CELLS, (grid.left + column) // _BLOCK_CELLS])
+    order = np.lexsort(place.T)
+    row, column, block = row[order], column[order], group_index(place[order])
+    if not len(row):
+        return Beside(*np.zeros((3, 0)))
+    error = off[row, column]
+    error = error - group_median(block, error)[block]
+    enough = (np.bincount(block) >= _LEAST_IN_BLOCK)[block]
+    return Beside(error[enough], matched.noise[row, column][enough], cells.noise[row, column][enough])
+
+
+def noise_scale(beside: Beside) -> float:
+    """Error of matched cells over their stated noise, at least 1; the usual one where the laser says too little.
+
+    The scale under which 68 % of the differences are within one sigma; where their tail is longer than a normal
+    distribution's, widened halfway, on a scale of ratios, to what would hold 95 % within two.
+    """
+    error, noise, laser = beside
+    if len(error) < _LEAST_COMPARED:
+        return _USUAL
+    scale = float(np.quantile(np.sqrt(np.maximum(error**2 - laser**2, 0)) / noise, _ONE_SIGMA))
+    tail = float(np.quantile(np.abs(error) / np.hypot(scale * noise, laser), _TWO_SIGMA)) / 2
+    return max(1.0, scale * max(1.0, tail) ** 0.5)
