@@ -15,7 +15,8 @@ Array = NDArray[Any]
 Mask = NDArray[np.bool_]
 Pixels = NDArray[np.uint8]
 
-_WINDOW = (9, 9)
+WINDOW_PX = 9
+_WINDOW = (WINDOW_PX, WINDOW_PX)
 _ROUNDS = 3
 _FINER = np.float32(4)  # OpenCV looks up at 32nds of a pixel, and its cubic is a 25th of a pixel off between pixels
 _LONGEST_STEP_PX = 0.5  # of a round

@@ -14,10 +14,12 @@ from .grids import Grid, window
 
 Array = NDArray[np.float64]
 
-_BLOCK_CELLS, _LEAST_IN_BLOCK = 25, 12  # poses move matching against the laser by decimetres of ground at a time
+# poses move matching against the laser by decimetres of ground at a time
+_BLOCK_M, _BLOCK_CELLS, _LEAST_IN_BLOCK = 0.5, 25, 12
 _LEAST_COMPARED = 100
 _USUAL = 1.5  # where the laser says too little: of simulated surveys, 1.1 on even ground to 1.8 on rough
 _JUDGE = 1.0  # of a cell's noise: where the laser's own is more, it tells nothing
+_MOST = 3.0
 _ONE_SIGMA, _TWO_SIGMA = 0.6827, 0.9545
 
 
@@ -33,6 +35,9 @@ class Beside(NamedTuple):
     error: Array
     noise: Array
     laser: Array
+
+
+NOTHING = Beside(*np.zeros((3, 0)))
 
 
 def instead_of_laser(cells: Cells, beside: Cells) -> Cells:
@@ -53,11 +58,12 @@ def compare(grid: Grid, matched: Cells, cells: Cells, counted: Grid) -> Beside:
     # both are where their soundings lie on average, which is not the same place
     off = matched.elevation - cells.elevation - east * (matched.x - cells.x) + south * (matched.y - cells.y)
     row, column = np.nonzero(both & np.isfinite(off) & (cells.noise < _JUDGE * matched.noise))
-    place = np.column_stack([(grid.top - row) // _BLOCK_CELLS, (grid.left + column) // _BLOCK_CELLS])
+    across = max(_BLOCK_CELLS, round(_BLOCK_M / grid.cell_m))
+    place = np.column_stack([(grid.top - row) // across, (grid.left + column) // across])
     order = np.lexsort(place.T)
     row, column, block = row[order], column[order], group_index(place[order])
     if not len(row):
-        return Beside(*np.zeros((3, 0)))
+        return NOTHING
     error = off[row, column]
     error = error - group_median(block, error)[block]
     enough = (np.bincount(block) >= _LEAST_IN_BLOCK)[block]
@@ -65,7 +71,7 @@ def compare(grid: Grid, matched: Cells, cells: Cells, counted: Grid) -> Beside:
 
 
 def noise_scale(beside: Beside) -> float:
-    """Error of matched cells over their stated noise, at least 1; the usual one where the laser says too little.
+    """Error of matched cells over their stated noise, from 1 to 3; the usual one where the laser says too little.
 
     The scale under which 68 % of the differences are within one sigma; where their tail is longer than a normal
     distribution's, widened halfway, on a scale of ratios, to what would hold 95 % within two.
@@ -75,4 +81,4 @@ def noise_scale(beside: Beside) -> float:
         return _USUAL
     scale = float(np.quantile(np.sqrt(np.maximum(error**2 - laser**2, 0)) / noise, _ONE_SIGMA))
     tail = float(np.quantile(np.abs(error) / np.hypot(scale * noise, laser), _TWO_SIGMA)) / 2
-    return max(1.0, scale * max(1.0, tail) ** 0.5)
+    return min(max(1.0, scale * max(1.0, tail) ** 0.5), _MOST)

@@ -31,7 +31,7 @@ _ROUGH_RADIUS = 5  # cells, of the square whose planes tell how rough the ground
 _EVEN = 1.16  # chi squared over its freedom of all of them, a sigma above what even ground has
 _MOST_MISFIT = 9.0  # of one plane's chi squared over its freedom that counts: more is an edge
 _WHOLE = 1e-12  # m2; sums of whole numbers are the same in whatever order
-REACH = _RADII[-1] + _ROUGH_RADIUS + _RADII[0]  # cells, of what a cell depends on
+REACH = _RADII[-1] + _ROUGH_RADIUS + _RADII[0] + 1  # cells, of what a cell depends on; the last one is of spikes
 
 
 class _Moments(NamedTuple):
@@ -62,6 +62,17 @@ class _Around(NamedTuple):
     rough: Array
 
 
+class _Plane(NamedTuple):
+    """Of some cells (n,) the planes around them: height and its variance at the cell's centre over the cell's own
+    value, m; slopes in metres a cell; chi squared over its freedom."""
+
+    height: Array
+    variance: Array
+    slope_x: Array
+    slope_y: Array
+    misfit: Array
+
+
 class _Found(NamedTuple):
     """Of some cells (n,): elevation and noise at their centres, whether it is there, by what the ground is uneven."""
 
@@ -71,12 +82,13 @@ class _Found(NamedTuple):
     uneven: Array
 
 
-def matched(grid: Grid, cells: Cells, noise_scale: float = 1.0) -> Cells:
+def matched(grid: Grid, cells: Cells, window_m: float = 0.0, noise_scale: float = 1.0) -> Cells:
     """Cells with matched ones smoothed and carried to their centres; those of the laser as they are.
 
-    A cell depends on those within `REACH` cells of it and on nothing else.
+    A cell depends on those within `REACH` cells of it and on nothing else. Cells in one window of matching, window_m
+    wide, share its noise: as many of them as it has are averaged as if they were one.
 
-    noise_scale : what matched cells err by, their noise by the images being 1, as `matching_noise` finds it.
+    noise_scale : what matched cells err by, their noise so found being 1 (`matching_noise`).
     """
     wanted = np.flatnonzero(cells.source == MATCHING)
     if not len(wanted):
@@ -86,16 +98,16 @@ def matched(grid: Grid, cells: Cells, noise_scale: float = 1.0) -> Cells:
     z = np.where(cells.source == MATCHING, _without_spikes(cells.elevation), cells.elevation)
     noise = np.where(cells.density > 0, (np.maximum(cells.noise, 1e-5) / _NOISE_M) ** 2, np.inf)
     rim = _RADII[-1]
-    u, v, heights = (np.pad(np.nan_to_num(values), rim).ravel() for values in (x, y, z))
+    u, v = (np.pad(np.nan_to_num(values), rim).ravel().astype(np.float32) for values in (x, y))
+    heights = np.pad(np.nan_to_num(z), rim).ravel()
     variance = np.pad(noise, rim, constant_values=np.inf).ravel().astype(np.float32)
     width = grid.width + 2 * rim
-    around = _Around(
-        width, u.astype(np.float32), v.astype(np.float32), 1 / variance, heights, variance, np.zeros_like(variance)
-    )
+    around = _Around(width, u, v, 1 / variance, heights, variance, np.zeros_like(variance))
     here = (wanted // grid.width + rim) * width + wanted % grid.width + rim
     rough = np.pad(_roughness(grid, around, wanted, here), rim).ravel().astype(np.float32)
     around = around._replace(weight=1 / (variance + rough), rough=rough)
-    parts = [_smoothed(around, here[k : k + _TOGETHER]) for k in range(0, len(here), _TOGETHER)]
+    alike = max(1.0, window_m / grid.cell_m) ** 2
+    parts = [_smoothed(around, here[k : k + _TOGETHER], alike) for k in range(0, len(here), _TOGETHER)]
     found = _Found(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     elevation, sigma, noise, x, y = (
         values.copy() for values in (cells.elevation, cells.sigma, cells.noise, cells.x, cells.y)
@@ -113,17 +125,18 @@ def matched(grid: Grid, cells: Cells, noise_scale: float = 1.0) -> Cells:
 def _roughness(grid: Grid, around: _Around, wanted: NDArray[np.int64], here: NDArray[np.int64]) -> Array:
     """Variance (height, width) of how far the ground departs from the planes through nine cells.
 
-    What is left of the planes around each matched cell beyond their noise, all together; units of `_Around`.
+    What is left of the planes around each matched cell beyond their noise, all together; units of `_Around`. Where
+    cells differ in their noise it is a little too low: the better ones hold the plane.
     """
     excess, freedom = np.zeros(grid.shape), np.zeros(grid.shape)
     for k in range(0, len(here), _TOGETHER):
         some, cell = here[k : k + _TOGETHER], wanted[k : k + _TOGETHER]
         sums, count = _nothing(len(some))
         _add_ring(sums, count, (0, _RADII[0]), around, some)
-        _, variance, misfit = _plane(sums, count)
-        told = (count >= _LEAST_CELLS) & (variance > 0)
-        free = np.where(told, count - 3, 0)
-        more = (np.clip(np.where(told, misfit, 0), 0, _MOST_MISFIT) - _EVEN) * free * count / np.maximum(sums.one, 1e-9)
+        plane = _plane(sums, count)
+        told = (count >= _LEAST_CELLS) & (plane.variance > 0) & np.isfinite(plane.misfit)
+        free, misfit = np.where(told, count - 3, 0), np.clip(np.where(told, plane.misfit, 0), 0, _MOST_MISFIT)
+        more = (misfit - _EVEN) * free * count / np.maximum(sums.one, 1e-9)
         excess.ravel()[cell], freedom.ravel()[cell] = np.round(more * (_NOISE_M**2 / _WHOLE)), free
     size = (2 * _ROUGH_RADIUS + 1,) * 2
     total, free = (
@@ -137,9 +150,14 @@ def _nothing(count: int) -> tuple[_Moments, Array]:
     return _Moments(*(np.zeros(count, np.float32) for _ in _Moments._fields)), np.zeros(count, np.float32)
 
 
-def _smoothed(around: _Around, here: NDArray[np.int64]) -> _Found:
-    """The cells at some places among all, each by the largest plane that says the same as all smaller ones."""
-    z, own, rough = (values[here].astype(float) for values in (around.z, around.noise, around.rough))
+def _smoothed(around: _Around, here: NDArray[np.int64], alike: float) -> _Found:
+    """The cells at some places among all, each by the largest plane that says the same as all smaller ones.
+
+    alike : how many cells err as one.
+    """
+    x, y, z, own, rough = (
+        values[here].astype(float) for values in (around.x, around.y, around.z, around.noise, around.rough)
+    )
     kept = rough / (rough + own)  # how much of a cell's departure from its plane is the seabed's
     found, noise, uneven = z.copy(), np.zeros(len(here)), np.ones(len(here))
     low, high = np.full(len(here), -np.inf), np.full(len(here), np.inf)
@@ -148,20 +166,24 @@ def _smoothed(around: _Around, here: NDArray[np.int64]) -> _Found:
     for radius in _RADII:
         _add_ring(sums, count, (last, radius), around, here)
         last = radius
-        plane, variance, misfit = _plane(sums, count)
+        plane = _plane(sums, count)
+        misfit, most = plane.misfit, _most(count)
         if radius == _RADII[0]:
-            uneven = np.sqrt(np.where((count >= _LEAST_CELLS) & (misfit > _most(count)), misfit, 1))
-        enough = going & (count >= _LEAST_CELLS) & np.isfinite(plane) & (variance > 0)
-        height = (1 - kept) * np.where(enough, plane, 0)
-        variance = kept * own * _NOISE_M**2 + (1 - kept) ** 2 * np.where(enough, variance, 0)
+            uneven = np.sqrt(np.where((count >= _LEAST_CELLS) & (misfit > most), misfit, 1))
+        enough = going & (count >= _LEAST_CELLS) & np.isfinite(plane.height) & (plane.variance > 0)
+        height, variance, slope_x, slope_y = (np.where(enough, values, 0) for values in plane[:4])
         spread = _INTERVAL * np.sqrt(variance)
         low, high = (
             np.where(enough, np.maximum(low, height - spread), low),
             np.where(enough, np.minimum(high, height + spread), high),
         )
-        even = (misfit < _most(count)) & (low <= high) & (height >= low) & (height <= high)
+        even = (misfit < most) & (low <= high) & (height >= low) & (height <= high)
         better = enough & even
-        found[better], noise[better] = (z + height)[better], np.sqrt(variance[better])
+        # the plane at the centre, and what the cell departs from it where it lies
+        value = z + height - kept * (height + slope_x * x + slope_y * y)
+        mean = np.minimum(alike * variance, own * _NOISE_M**2)
+        error = kept * own * _NOISE_M**2 + (1 - kept) ** 2 * np.maximum(mean, variance)
+        found[better], noise[better] = value[better], np.sqrt(error[better])
         at_centre |= better
         going &= better | ~enough
     return _Found(found, noise, at_centre, uneven)
@@ -203,8 +225,7 @@ def _add_ring(sums: _Moments, count: Array, radii: tuple[int, int], around: _Aro
             count += w > 0
 
 
-def _plane(m: _Moments, count: Array) -> tuple[Array, Array, Array]:
-    """Of the planes that fit: height at the cell's centre over its value, its variance, chi squared over freedom."""
+def _plane(m: _Moments, count: Array) -> _Plane:
     a, b, c = m.xx * m.yy - m.xy**2, m.xy * m.y - m.x * m.yy, m.x * m.xy - m.xx * m.y
     with np.errstate(divide="ignore", invalid="ignore"):
         determinant = m.one * a + m.x * b + m.y * c
@@ -212,4 +233,5 @@ def _plane(m: _Moments, count: Array) -> tuple[Array, Array, Array]:
         slope_x = (b * m.z + (m.one * m.yy - m.y**2) * m.xz + (m.x * m.y - m.one * m.xy) * m.yz) / determinant
         slope_y = (c * m.z + (m.x * m.y - m.one * m.xy) * m.xz + (m.one * m.xx - m.x**2) * m.yz) / determinant
         left = m.zz - height * m.z - slope_x * m.xz - slope_y * m.yz
-        return height, _NOISE_M**2 * a / determinant, left / _NOISE_M**2 / np.maximum(count - 3, 1)
+        misfit = left / _NOISE_M**2 / np.maximum(count - 3, 1)
+        return _Plane(height, _NOISE_M**2 * a / determinant, slope_x, slope_y, misfit)

@@ -89,7 +89,7 @@ def _scale(m: MapJob) -> int:
 def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
     camera, poses, (i, j) = m.job.calibration.camera, solution.poses, (pair.i.row, pair.j.row)
     known = np.concatenate([tie_points(m, pair.ties).X_local, *(sounded(m, k, solution) for k in (pair.i, pair.j))])
-    nothing = Made({}, {"cells": 0})
+    nothing = Made({}, {"cells": 0, "window_m": 0.0})
     axes = dense.rectified_axes(poses, i, j)
     if not len(known) or axes is None:
         return nothing
@@ -115,7 +115,8 @@ def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
     cells = dense_cells.reduce_to_cells(
         to_map(relief.X_local), relief.metres_per_px, relief.noise_px, to_map(known), m.cell_m, expected
     )
-    return Made(cells._asdict(), {"cells": len(cells.X_map)})
+    window_m = dense_refine.WINDOW_PX * m.cell_m / pixels_a_cell
+    return Made(cells._asdict(), {"cells": len(cells.X_map), "window_m": round(window_m, 4)})
 
 
 def sounded(m: MapJob, image: Image, solution: Solution) -> np.ndarray:
@@ -142,14 +143,15 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
     """How well matching agrees with the laser over some pairs.
 
     The info has the 1-sigma of dense matching and tie points in pixels of disparity, dense_px and tie_px, and that of
-    the laser's elevations by its images' poses, laser_m (_UNKNOWN_M where nothing tells).
+    the laser's elevations by its images' poses, laser_m (_UNKNOWN_M where nothing tells); and how wide the windows of
+    dense matching are on the ground, window_m (0 without).
 
     pairs : each with the key of its dense matching, "" without, and the images that touch it.
     """
     solution = solve.solution(m.job, m.adjusted)
 
     def make() -> Made:
-        dense_off, tie_off = [dense_cells.NO_DIFFERENCES], [dense_cells.NO_DIFFERENCES]
+        dense_off, tie_off, windows = [dense_cells.NO_DIFFERENCES], [dense_cells.NO_DIFFERENCES], [0.0]
         for pair, key, around in pairs:
             near, within = solution.poses.C_local[pair.i.row], _WITHIN_CELLS * m.cell_m
             lit = [m.frame.map_around(sounded(m, image, solution), near) for image in around]
@@ -158,6 +160,7 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
             tie_off.append(dense_cells.differences(there, ties.metres_per_px, np.concatenate(lit), within))
             if key:
                 cells = read_cells(m, key)
+                windows.append(load(m.job, STEP, key, ()).info["window_m"])
                 X, scale = cells.X_map[cells.borne_out], cells.metres_per_px[cells.borne_out]
                 dense_off += [dense_cells.departures(X, scale, soundings, m.cell_m) for soundings in lit]
         dense_m, dense_px = (np.concatenate(values) for values in zip(*dense_off, strict=True))
@@ -165,6 +168,7 @@ def agreement(m: MapJob, pairs: Sequence[tuple[DensePair, str, tuple[Image, ...]
         found = {
             "dense_px": dense_cells.share_of_each(dense_px, _DENSE_PX),
             "tie_px": dense_cells.share_of_each(tie_px, _TIE_PX),
+            "window_m": float(np.median(windows[1:] or windows)),
             "laser_m": dense_cells.share_of_each(dense_m if dense_cells.tell(dense_m) else tie_m, _UNKNOWN_M),
         }
         return Made({}, {name: round(value, 4) for name, value in found.items()})

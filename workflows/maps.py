@@ -30,7 +30,7 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
     """Soundings, tie points and dense matching of a tile, gridded. agreed : by `dense.agreement`."""
     solution = relative(solve.solution(m.job, m.adjusted), agreed.info["laser_m"])
     # what was found and not from what: another image elsewhere is no reason to make this tile anew
-    said = [agreed.info[name] for name in ("dense_px", "tie_px")] + [round(_bend_m(solution), 4)]
+    said = [agreed.info[name] for name in ("dense_px", "tie_px", "window_m")] + [round(_bend_m(solution), 4)]
     inputs = [f"{image.row}:{image.key}" for image in tile.images] + [pose_digest(solution, rows_of(tile))]
     inputs += [f"{pair.i}-{pair.j}:{pair.ties}:{pair.dense}" for pair in tile.pairs]
 
@@ -49,7 +49,7 @@ def cells_tile(m: MapJob, tile: Tile, agreed: Done) -> Done:
             at = np.flatnonzero(cells.density)
             made[f"{prefix}cell"] = at.astype(np.int32)
             made |= {f"{prefix}{name}": values.ravel()[at] for name, values in cells._asdict().items()}
-        return Made(made, {"sounded": len(made["cell"])})
+        return Made(made, {"sounded": len(made["cell"]), "window_m": agreed.info["window_m"]})
 
     return once(m.job, CELLS, _VERSION, inputs, [context(m, tile), said], make)
 
@@ -152,7 +152,7 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
     def make() -> Made:
         reach = m.max_interpolation_m
         held = []
-        scale = matching_noise.noise_scale(_beside(m, samples))
+        scale = round(matching_noise.noise_scale(_beside(m, samples)), 4)
         for sample in samples:  # twice over all of them, so that one is held at a time
             halo = _halo(m, sample.tile)
             held.append(surface.hold_out(halo, _cells(m.job, halo, sample.neighbours, scale), reach, sample.tile))
@@ -165,7 +165,7 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
             seen = surface.seen(sample.tile, sample.outlines)
             sigma.append(np.where(known.density[inner] > 0, 0.0, found.sigma[inner])[seen])
         worst = surface.worst_shown(np.concatenate(sigma), m.least_seen, m.max_sigma_m)
-        return Made({}, {**law._asdict(), "noise_scale": round(scale, 4), "max_sigma_m": worst})
+        return Made({}, {**law._asdict(), "noise_scale": scale, "max_sigma_m": worst})
 
     inputs = [done.key for sample in samples for _, done in sample.neighbours]
     inputs.append(array_digest(*(np.round(sample.outlines, 3) for sample in samples)))
@@ -175,12 +175,15 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
 
 def _beside(m: MapJob, samples: Sequence[Sample]) -> matching_noise.Beside:
     """Matched cells beside the laser's in some tiles."""
-    found = []
+    found = [matching_noise.NOTHING]
     for sample in samples:
         halo = grids.pad(sample.tile, smooth.REACH + 1)
-        cells, beside = (_gridded(m.job, halo, sample.neighbours, prefix) for prefix in ("", _BESIDE))
-        matched = smooth.matched(halo, matching_noise.instead_of_laser(cells, beside))
-        found.append(matching_noise.compare(halo, matched, cells, sample.tile))
+        beside = _gridded(m.job, halo, sample.neighbours, _BESIDE)
+        if beside.density.any():
+            cells = _gridded(m.job, halo, sample.neighbours)
+            beside = matching_noise.instead_of_laser(cells, beside)
+            matched = smooth.matched(halo, beside, _window_m(sample.neighbours))
+            found.append(matching_noise.compare(halo, matched, cells, sample.tile))
     return matching_noise.Beside(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
@@ -235,7 +238,11 @@ def coarse_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]]) 
 
 
 def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]], noise_scale: float) -> Cells:
-    return smooth.matched(grid, _gridded(job, grid, tiles), noise_scale)
+    return smooth.matched(grid, _gridded(job, grid, tiles), _window_m(tiles), noise_scale)
+
+
+def _window_m(tiles: Sequence[tuple[Grid, Done]]) -> float:
+    return max((done.info["window_m"] for _, done in tiles), default=0.0)
 
 
 def _gridded(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]], prefix: str = "") -> Cells:

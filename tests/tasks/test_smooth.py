@@ -1,6 +1,7 @@
 """Matched cells averaged over planes: noise goes, edges stay."""
 
 import numpy as np
+import pytest
 from seamosaic.tasks import gridding, grids, smooth
 from seamosaic.tasks.grids import Grid
 
@@ -34,6 +35,37 @@ def test_even_ground_loses_its_noise_and_says_so():
     # what neighbours share does not average down
     assert np.median(after.sigma) > 0.001
     assert 0.97 < np.mean(np.abs(after.x - X)[5:-5, 5:-5] < 1e-9) <= 1
+
+
+@pytest.mark.parametrize("width", [1, 3])
+def test_cells_that_share_their_noise_are_not_averaged_as_if_they_did_not(width):
+    """Noise that is the same over squares of some cells, as it is in one window of matching."""
+    before = _cells(np.full(GRID.shape, -10.0), 0.0)._replace(noise=np.full(GRID.shape, 0.002))
+    rng = np.random.default_rng(3)
+    errors, stated = [], []
+    for _ in range(20):
+        coarse = rng.normal(0, 0.002, (GRID.height // width + 1, GRID.width // width + 1))
+        shared = np.kron(coarse, np.ones((width, width)))[: GRID.height, : GRID.width]
+        after = smooth.matched(GRID, before._replace(elevation=-10 + shared), width * GRID.cell_m)
+        errors.append(after.elevation[8:-8, 8:-8] + 10)
+        stated.append(after.noise[8:-8, 8:-8])
+    assert 0.8 < np.std(errors) / np.sqrt(np.mean(np.square(stated))) < 1.3
+
+
+def test_a_cell_that_keeps_its_own_value_is_carried_along_the_slope():
+    """Rough ground on a slope of 0.5, sounded beside the cells' centres and almost without noise."""
+    rng = np.random.default_rng(5)
+    bumps, aside = rng.normal(0, 0.001, GRID.shape), rng.uniform(-0.008, 0.008, GRID.shape)
+    at_centre = -10 + 0.5 * (X - X.min()) + bumps
+    cells = _cells(at_centre, 0.0)._replace(
+        elevation=at_centre + 0.5 * aside, noise=np.full(GRID.shape, 0.0005), x=X + aside, y=Y
+    )
+    after = smooth.matched(GRID, cells)
+    moved = (np.abs(after.x - X) < 1e-9)[6:-6, 6:-6]
+    error = (after.elevation - at_centre)[6:-6, 6:-6][moved]
+    assert moved.mean() > 0.9
+    # 0.0016 if the slope did not count
+    assert 0.0001 < np.median(np.abs(error)) < 0.0004
 
 
 def test_ground_as_rough_as_its_noise_is_met_halfway():
@@ -84,7 +116,8 @@ def test_spikes_go_and_the_laser_stays():
 
 
 def test_a_cell_is_the_same_in_every_tile():
-    cells = _cells(-10 + 0.05 * np.sin(9 * X) * np.cos(7 * Y), 0.002)
+    rough = np.random.default_rng(7).normal(0, 0.003, GRID.shape)
+    cells = _cells(-10 + 0.05 * np.sin(9 * X) * np.cos(7 * Y) + rough, 0.002)
     whole = smooth.matched(GRID, cells)
     part = grids.pad(GRID, -13)
     cut = grids.window(GRID, part)
