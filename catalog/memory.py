@@ -113,7 +113,8 @@ def _keys(url: str) -> dict[str, str | None]:
 def _state(keys: Mapping[str, str | None]) -> str | None:
     if None in keys.values():
         return None
-    return sha256("\n".join(sorted(map(str, keys.values()))).encode())
+    # files that are none of the mission's may have any name
+    return sha256("\n".join(sorted(map(str, keys.values()))).encode("utf-8", "surrogateescape"))
 
 
 def _texts_same(url: str, texts: Mapping[str, str]) -> bool:

@@ -7,6 +7,7 @@ the top left corner of the texture, in units of its width and height.
 import json
 import os
 import struct
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -50,7 +51,9 @@ def write_ply(
 def _ply_header(fields: list[tuple[str, str]], points: int, faces: int, comments: Sequence[str]) -> bytes:
     types = {"<f4": "float", "u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [f"comment {line}" for comment in comments for line in comment.splitlines()]
+    # readers take lines of at most 1,023 bytes
+    pieces = [piece for comment in comments for line in comment.splitlines() for piece in textwrap.wrap(line, 900)]
+    lines += [f"comment {piece}" for piece in pieces]
     lines += [f"element vertex {points}", *(f"property {types[kind]} {name}" for name, kind in fields)]
     lines += [f"element face {faces}", "property list uchar int vertex_indices", "end_header", ""]
     return "\n".join(lines).encode("ascii", "replace")

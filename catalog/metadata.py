@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 import pyproj
 import rasterio
 import shapely
+from numpy.typing import NDArray
 from rasterio.coords import BoundingBox
 
 from ..schemas.base import Model
@@ -105,10 +107,10 @@ def write_stac_item(
     digests: Mapping[str, str],
     properties: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write metadata/stac-item.json (STAC 1.0) for a version whose map has geographic coordinates.
+    """Write metadata/stac-item.json (STAC 1.0).
 
-    Geometry and projection are those of bathymetry.tif; every file of the product table that is in the folder
-    becomes an asset.
+    Geometry and projection are those of bathymetry.tif, without navigation there is no geometry; every file of the
+    product table that is in the folder becomes an asset.
 
     Parameters
     ----------
@@ -119,16 +121,17 @@ def write_stac_item(
     root = Path(folder)
     with rasterio.open(root / "bathymetry.tif") as file:
         crs, bounds = pyproj.CRS.from_wkt(file.crs.to_wkt()), file.bounds
-    ring = _geographic_outline(crs, bounds)
-    geometry, bbox = _geometry(ring)
-    code = _authority_code(crs)
+    place = {"geometry": None}
+    if not crs.is_engineering:
+        geometry, bbox = _geometry(_geographic_outline(crs, bounds))
+        place = {"bbox": bbox, "geometry": geometry}
+    code = authority_code(crs)
     item = {
         "type": "Feature",
         "stac_version": "1.0.0",
         "stac_extensions": [_PROJECTION, FILE_EXTENSION],
         "id": f"{mission_id}-v{version_number}",
-        "bbox": bbox,
-        "geometry": geometry,
+        **place,
         "properties": {
             "title": title or mission_id,
             "datetime": None,
@@ -148,12 +151,13 @@ def write_stac_item(
     return path
 
 
-def _authority_code(crs: pyproj.CRS) -> str | None:
-    """EPSG:code, or EPSG:horizontal+vertical for a compound CRS; None where a part has no code."""
-    codes = [part.to_authority() for part in (crs.sub_crs_list if crs.is_compound else [crs])]
-    if any(code is None for code in codes):
+def authority_code(crs: pyproj.CRS) -> str | None:
+    """EPSG:code, or EPSG:horizontal+vertical for a compound CRS; None where that does not name it."""
+    found = [part.to_authority() for part in (crs.sub_crs_list if crs.is_compound else [crs])]
+    codes = [code for code in found if code is not None]
+    if len(codes) < len(found) or len({authority for authority, _ in codes}) > 1:
         return None
-    return f"{codes[0][0]}:{'+'.join(code[1] for code in codes)}"
+    return f"{codes[0][0]}:{'+'.join(code for _, code in codes)}"
 
 
 def _present(root: Path) -> Iterable[Product]:
@@ -195,6 +199,8 @@ def _geometry(ring: Sequence[tuple[float, float]]) -> tuple[dict[str, Any], list
     """GeoJSON geometry and bounding box of an outline; across the 180th meridian it is cut there (RFC 7946, 3.1.9)."""
     longitude, latitude = np.array(ring).T
     longitude = np.unwrap(longitude, period=360)
+    if abs(longitude[-1] - longitude[0]) > 180:
+        return _around_a_pole(longitude[:-1], latitude[:-1])
     bbox = [longitude.min(), latitude.min(), longitude.max(), latitude.max()]
     if bbox[0] >= -180 and bbox[2] <= 180:
         return {"type": "Polygon", "coordinates": [[list(point) for point in ring]]}, [float(edge) for edge in bbox]
@@ -207,6 +213,21 @@ def _geometry(ring: Sequence[tuple[float, float]]) -> tuple[dict[str, Any], list
             parts.append([np.round(edge, 9).tolist()])
     west, east = ((bbox[k] + 180) % 360 - 180 for k in (0, 2))
     return {"type": "MultiPolygon", "coordinates": parts}, [float(edge) for edge in (west, bbox[1], east, bbox[3])]
+
+
+def _around_a_pole(
+    longitude: NDArray[np.floating], latitude: NDArray[np.floating]
+) -> tuple[dict[str, Any], list[float]]:
+    """Of an outline (N,) with a pole inside: on a plate carrée it reaches from one edge to the other."""
+    longitude = (longitude + 180) % 360 - 180
+    order = np.argsort(longitude)
+    longitude, latitude = longitude[order], latitude[order]
+    pole = math.copysign(90, latitude[0])
+    edge = float(np.interp(180, [longitude[-1], longitude[0] + 360], latitude[[-1, 0]]))
+    x, y = [-180, *longitude, 180, 180, -180], [edge, *latitude, edge, pole, pole]
+    whole = shapely.orient_polygons(shapely.Polygon(np.column_stack([x, y])))
+    geometry = {"type": "Polygon", "coordinates": [np.round(shapely.get_coordinates(whole), 9).tolist()]}
+    return geometry, [-180.0, float(min(y)), 180.0, float(max(y))]
 
 
 def _rfc3339(time: datetime) -> str:

@@ -207,7 +207,24 @@ def find_images(files: MissionFiles, mission: Mission, document: Document) -> tu
         for name, (path, info) in matching.items():
             images.setdefault(name, ImageFile(name, image_set.role, path, info))
             owner.setdefault(name, image_set.path)
+        nameless = [name for name in matching if not _is_text(name)]
+        if nameless:
+            found = f"{len(nameless)} images whose names are no text in UTF-8, such as {nameless[0]!a}"
+            problems.append(
+                Problem(
+                    document.file, line, f"images.{i}.path", found, "names in UTF-8", "Rename them, e.g. with convmv."
+                )
+            )
     return [images[name] for name in sorted(images)], problems
+
+
+def _is_text(name: str) -> bool:
+    """Whether a file's name is text: one of another encoding comes with surrogates in it."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _no_match_remedy(files: MissionFiles, pattern: str) -> str:

@@ -11,13 +11,11 @@ from typing import Final, NamedTuple
 
 import pystac
 
-from ..schemas.products import PRODUCTS
 from . import json_files, versions
-from .metadata import FILE_EXTENSION, multihash
 from .versions import Version
 
 CATALOG: Final = "catalog.json"
-_COLLECTION, _ITEMS = "collection.json", "items"
+_COLLECTION, _ITEMS, _OWN_ITEM = "collection.json", "items", "metadata/stac-item.json"
 _VERSION_EXTENSION: Final = "https://stac-extensions.github.io/version/v1.2.0/schema.json"
 _WORLD: Final = (-180.0, -90.0, 180.0, 90.0)  # what STAC asks for where there is no position
 
@@ -40,17 +38,18 @@ def update_mission(products: str, entry: MissionEntry, title: str) -> None:
     title : of the archive.
     """
     found = versions.list_versions(products, entry.id)
-    if not found:
+    read = [_item(entry.id, version, newest=version is found[-1]) for version in found]
+    made = {version.number: item for version, item in zip(found, read, strict=True) if item is not None}
+    if not made:
         return
     folder = f"{products.rstrip('/')}/{entry.id}"
-    items = [_item(entry, version, newest=version is found[-1]) for version in found]
-    for version, item in zip(found, items, strict=True):
-        json_files.write_json(f"{folder}/{_ITEMS}/v{version.number}.json", item.to_dict(include_self_link=False))
-    collection = _collection(entry, items)
-    for version in found:
-        collection.add_link(_link(pystac.RelType.ITEM, f"./{_ITEMS}/v{version.number}.json", pystac.MediaType.GEOJSON))
+    for number, item in made.items():
+        json_files.write_json(f"{folder}/{_ITEMS}/v{number}.json", item.to_dict(include_self_link=False))
+    collection = _collection(entry, list(made.values()))
+    for number in made:
+        collection.add_link(_link(pystac.RelType.ITEM, f"./{_ITEMS}/v{number}.json", pystac.MediaType.GEOJSON))
     json_files.write_json(f"{folder}/{_COLLECTION}", collection.to_dict(include_self_link=False))
-    kept = {f"v{version.number}.json" for version in found}
+    kept = {f"v{number}.json" for number in made}
     for name in json_files.names(f"{folder}/{_ITEMS}"):
         if name not in kept:
             json_files.remove(f"{folder}/{_ITEMS}/{name}")
@@ -106,44 +105,22 @@ def _link(relation: str, target: str, media_type: str = pystac.MediaType.JSON) -
     return pystac.Link(relation, target, media_type)
 
 
-def _item(entry: MissionEntry, version: Version, newest: bool) -> pystac.Item:
-    """The item that the run wrote, with its place in the catalogue; one without a geometry if there is none."""
-    value = json_files.read_json(f"{version.path}/metadata/stac-item.json")
-    item = pystac.Item.from_dict(value) if isinstance(value, dict) else _placeless(entry, version)
-    item.id = f"{entry.id}-v{version.number}"  # the run that wrote it could only guess its number
+def _item(mission_id: str, version: Version, newest: bool) -> pystac.Item | None:
+    """The item that the run wrote, with its place in the catalogue; None if it is gone."""
+    value = json_files.read_json(f"{version.path}/{_OWN_ITEM}")
+    if not isinstance(value, dict):
+        return None
+    item = pystac.Item.from_dict(value)
+    item.id = f"{mission_id}-v{version.number}"  # the run that wrote it could only guess its number
     for asset in item.assets.values():
         asset.href = f"../v{version.number}/{asset.href.removeprefix('../')}"
     item.properties |= {"version": str(version.number), "deprecated": not newest}
     item.stac_extensions = [*item.stac_extensions, _VERSION_EXTENSION]
     item.clear_links()
-    item.collection_id = entry.id
+    item.collection_id = mission_id
     item.add_link(_link("root", f"../../{CATALOG}"))
     for relation in ("parent", "collection"):
         item.add_link(_link(relation, f"../{_COLLECTION}"))
-    return item
-
-
-def _placeless(entry: MissionEntry, version: Version) -> pystac.Item:
-    """The item of a mission without navigation, whose maps have no place on the globe."""
-    start, end = _span(entry)
-    properties = {"title": entry.title or entry.id, "platform": entry.platform}
-    item = pystac.Item(
-        id=f"{entry.id}-v{version.number}",
-        geometry=None,
-        bbox=None,
-        datetime=None,
-        start_datetime=start,
-        end_datetime=end,
-        properties={name: value for name, value in properties.items() if value},
-    )
-    item.stac_extensions = [FILE_EXTENSION]
-    digests = (json_files.read_json(f"{version.path}/{versions.PROVENANCE}") or {}).get("outputs", {})
-    for product in PRODUCTS:
-        if product.name in digests or product.name == versions.PROVENANCE:
-            asset = pystac.Asset(product.name, product.name, product.description, product.media_type, [product.role])
-            if product.name in digests:
-                asset.extra_fields["file:checksum"] = multihash(digests[product.name])
-            item.add_asset(product.name, asset)
     return item
 
 

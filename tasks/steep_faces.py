@@ -7,6 +7,7 @@ by side below the orthomosaic in a tile's texture.
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -136,25 +137,27 @@ def _seen(corners: Array, normal: Array, shot: Shot, lie: Lie) -> _Seen:
     ahead = X[:, 2] > 0.05
     safe = np.where(ahead[:, None], X, [0.0, 0.0, 1.0])
     uv = np.stack(pixels(departure(shot.camera), *safe.T), -1).astype(float)
-    best = _is_best(shot, uv) & ahead
-    uv = uv.reshape(-1, 3, 2)
+    uv, ahead = uv.reshape(-1, 3, 2), ahead.reshape(-1, 3).all(1)
     first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
     centre = corners.mean(1)
     ray = _centre(lie) - centre
     range_m = np.linalg.norm(ray, axis=1)
     facing = (ray * normal).sum(1) / np.maximum(range_m * np.linalg.norm(normal, axis=1), 1e-12)
-    shown = best.reshape(-1, 3).all(1) & (facing > _FACING)
+    shown = _all_best(shot, uv) & ahead & (facing > _FACING)
     return _Seen(uv, np.where(shown, area, 0.0), range_m)
 
 
-def _is_best(shot: Shot, uv: Array) -> NDArray[np.bool_]:
-    """Which pixels are in the image, away from its rim and from the laser."""
-    scale, (height, width) = quality_scale(shot.camera), shot.quality.shape
+def _all_best(shot: Shot, uv: Array) -> NDArray[np.bool_]:
+    """Which faces (K, 3, 2) are in the image, and all that is around them is away from its rim and from the laser."""
+    scale, size = quality_scale(shot.camera), shot.quality.shape[::-1]
     with np.errstate(invalid="ignore"):
-        column, row = (np.nan_to_num(np.floor((uv.T + 0.5) / scale), nan=-1)).astype(int)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return inside & (shot.quality[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] == BEST)
+        at = np.clip(np.nan_to_num(np.floor((uv + 0.5) / scale), nan=-1), -1, size).astype(int)
+    low, high = at.min(1), at.max(1)
+    inside = (low >= 0).all(1) & (high < size).all(1)
+    (left, top), (right, bottom) = np.clip(low, 0, size).T, np.clip(high + 1, 0, size).T
+    less = cv2.integral((shot.quality != BEST).astype(np.uint8))
+    return inside & (less[bottom, right] - less[top, right] - less[bottom, left] + less[top, left] == 0)
 
 
 def _connected(triangles: Faces) -> list[Faces]:

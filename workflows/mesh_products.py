@@ -6,8 +6,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pyproj
 
-from ..catalog import meshes, tiles3d
+from ..catalog import meshes, metadata, tiles3d
 from ..catalog.meshes import Part
 from ..schemas.products import MeshQuality
 from .job import Done, load
@@ -32,7 +33,8 @@ def write(results: Results, folder: Path, crs_wkt: str) -> MeshQuality:
     parts = [_part(results, place, done, origin, shrink) for place, done in chosen.items()]
     meshes.write_glb(folder / "mesh.glb", parts, about | {"axes": "x east, y up, z south"})
     vertices, triangles, colours = _joined(results, chosen, parts)
-    comments = [f"offset {west:.6f} {north:.6f} 0.000000", f"crs {crs_wkt}"]
+    crs = metadata.authority_code(pyproj.CRS.from_wkt(crs_wkt)) or crs_wkt
+    comments = [f"offset {west:.6f} {north:.6f} 0.000000", f"crs {crs}"]
     meshes.write_ply(folder / "mesh.ply", vertices, triangles, colours, comments=comments)
     finest = sum(done.info["triangles"] for place, done in pyramid.items() if not place.level)
     return MeshQuality(

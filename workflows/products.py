@@ -90,11 +90,10 @@ def _write_all(results: Results, folder: Path, made_from: str) -> Quality:
     digests = metadata.output_digests(folder, dict(ChainMap(*taken.values())))
     provenance = provenance.model_copy(update={"parts": parts, "outputs": digests})
     metadata.write_provenance(folder / "metadata" / "provenance.json", provenance)
-    if results.opened.crs is not None:  # last: it lists all other files
-        start, end = span(results.opened)
-        mission = results.opened.mission
-        number = versions.next_number(results.out, mission.id)
-        metadata.write_stac_item(folder, mission.id, number, mission.title, start, end, digests, _about(mission))
+    (start, end), mission = span(results.opened), results.opened.mission
+    number = versions.next_number(results.out, mission.id)
+    # last: it lists all other files
+    metadata.write_stac_item(folder, mission.id, number, mission.title, start, end, digests, _about(mission))
     return figures
 
 
@@ -115,9 +114,9 @@ def _parts(results: Results, crs_wkt: str) -> dict[str, str]:
     job, mapped, posed = results.job, results.mapped, results.posed
     common = [VERSION, memory.inputs_digest(results.opened), crs_wkt]
     made = {
-        "mosaics": [done.key for _, done in mapped.mosaic.tiles],
+        "mosaics": [str(mapped.mosaic.grid), *(done.key for _, done in mapped.mosaic.tiles)],
         "soundings": [posed.adjusted.key, *(done.key for done in posed.extracted.values())],
-        "mesh": [done.key for done in mapped.mesh.values()],
+        "mesh": [str(mapped.ground.grid), *(done.key for done in mapped.mesh.values())],
     }
     return {part: digest(part, VERSION, [*common, *keys], stage(job.parameters.mesh)) for part, keys in made.items()}
 

@@ -5,10 +5,12 @@ import json
 import struct
 
 import numpy as np
+import pyproj
 import pytest
 import trimesh
 from PIL import Image
 from seamosaic.catalog import meshes
+from seamosaic.tasks.open3d_loader import load_open3d
 
 RED, GREEN, BLUE, WHITE = (220, 30, 30), (30, 200, 30), (30, 30, 220), (240, 240, 240)
 EAST, NORTH = 4.0, 2.0
@@ -117,6 +119,18 @@ def test_ply_keeps_axes_colours_and_comments(tmp_path):
     assert header[1] == "format binary_little_endian 1.0"
     assert "comment crs EPSG:32631" in header
     assert "comment offset 5e5 4.7e6 0" in header
+
+
+def test_programs_that_take_short_header_lines_read_a_ply_with_a_long_crs(tmp_path):
+    vertices, triangles = surface(5)
+    wkt = pyproj.CRS("+proj=tmerc +lon_0=3.1 +ellps=WGS84 +units=m").to_wkt() * 2
+    meshes.write_ply(tmp_path / "m.ply", vertices, triangles, comments=[f"crs {wkt}"])
+    header = (tmp_path / "m.ply").read_bytes().partition(b"end_header")[0].splitlines()
+    assert max(map(len, header)) < 1000 < len(wkt)
+    comments = [line.removeprefix(b"comment ").decode() for line in header if line.startswith(b"comment")]
+    assert "".join(comments).replace(" ", "") == f"crs {wkt}".replace(" ", "")
+    read = load_open3d().io.read_triangle_mesh(str(tmp_path / "m.ply"))
+    assert len(read.triangles) == len(triangles)
 
 
 def test_an_empty_surface_is_a_readable_file(tmp_path):

@@ -7,7 +7,9 @@ from datetime import UTC, datetime, timedelta, timezone
 import numpy as np
 import pyproj
 import pytest
+import rasterio.coords
 import shapely
+from pyproj.crs import CompoundCRS
 from seamosaic.catalog import metadata, rasters
 from seamosaic.schemas.products import PRODUCTS, ImageCounts, MissionSummary, Quality
 from seamosaic.schemas.provenance import InputFile, Provenance, Step
@@ -104,6 +106,23 @@ def test_stac_geometry_is_where_the_map_is(tmp_path):
     assert (x, y) == pytest.approx((500_000.6, 4_719_999.6), abs=0.01)
 
 
+@pytest.mark.parametrize(("crs", "pole"), [("EPSG:3413", 90), ("EPSG:3031", -90)])
+def test_stac_geometry_of_a_map_around_a_pole_has_it_inside(crs, pole):
+    bounds = rasterio.coords.BoundingBox(-300, -500, 700, 400)
+    geometry, bbox = metadata._geometry(metadata._geographic_outline(pyproj.CRS(crs), bounds))
+    shape = shapely.geometry.shape(geometry)
+    assert shape.is_valid
+    assert shape.exterior.is_ccw
+    assert tuple(bbox) == pytest.approx(shape.bounds)
+    assert bbox[0::2] == [-180, 180]
+    assert pole in bbox
+    inside = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+    x, y = np.random.default_rng(0).uniform(-800, 800, (2, 2000))
+    there = (x > -300) & (x < 700) & (y > -500) & (y < 400)
+    found = shapely.contains_xy(shape, *inside.transform(x, y))
+    assert (found == there).mean() > 0.995
+
+
 def test_stac_assets_can_be_checked(tmp_path):
     item = version(tmp_path, CRS)
     asset = item["assets"]["bathymetry.tif"]
@@ -117,6 +136,12 @@ def test_stac_assets_can_be_checked(tmp_path):
 
 def test_stac_names_a_compound_crs_by_both_codes(tmp_path):
     assert version(tmp_path, pyproj.CRS("EPSG:32631+5714"))["properties"]["proj:code"] == "EPSG:32631+5714"
+
+
+def test_codes_of_different_authorities_name_no_compound_crs():
+    parts = [pyproj.CRS("EPSG:32631"), pyproj.CRS("ESRI:115700")]
+    assert metadata.authority_code(CompoundCRS("both", parts)) is None
+    assert metadata.authority_code(CompoundCRS("both", [parts[0], pyproj.CRS("EPSG:5714")])) == "EPSG:32631+5714"
 
 
 def test_stac_spells_out_a_crs_without_a_code(tmp_path):

@@ -1,9 +1,11 @@
 """Wrong missions: everything is said at once, without a traceback."""
 
+import os
 import shutil
 from pathlib import Path
 
 import pytest
+from seamosaic.catalog import memory
 from seamosaic.catalog.missions import open_mission
 
 from tests.catalog.edited import copy, edit, images, problem, problems, truncate, without_navigation
@@ -172,3 +174,18 @@ def test_laser_images_alone_need_navigation(tiny_mission: Path) -> None:
     edit(tiny_mission / "mission.yaml", ("combined", "laser"))
     without_navigation(tiny_mission)
     assert problem(tiny_mission).key == "navigation"
+
+
+def test_an_image_whose_name_is_no_text(tiny_mission: Path) -> None:
+    first = images(tiny_mission)[0]
+    os.rename(first, os.fsencode(first.parent) + b"/caf\xe9.jpg")
+    (found,) = [p for p in problems(tiny_mission) if p.expected == "names in UTF-8"]
+    assert found.key == "images.0.path"
+    assert "1 images whose names are no text in UTF-8, such as 'images/caf\\udce9.jpg'" in found.found
+
+
+def test_a_stray_file_may_have_any_name(tiny_mission: Path, tmp_path: Path) -> None:
+    (tiny_mission / "notes").mkdir()
+    Path(os.fsdecode(os.fsencode(tiny_mission / "notes") + b"/caf\xe9.txt")).write_text("")
+    for _ in range(2):
+        assert memory.open_known(str(tiny_mission), str(tmp_path / "out")).frames.sizes["image"] == 10

@@ -84,6 +84,25 @@ def test_neither_the_laser_nor_what_hides_it_is_shown():
     assert not [chart for chart in found if (X[triangles[chart.faces], 0] > -CELL).all(1).any()]
 
 
+def test_a_laser_line_between_the_corners_of_a_large_face_is_not_shown():
+    near = _lie(-0.3, 0, 1.4)
+    _, _, (chart, *_) = _charts([(_shot(0), near)])
+    across = chart.uv[..., 0]
+    column = across[np.ptp(across, axis=1).argmax()].mean()
+    crossed = (across.min(1) < column) & (across.max(1) > column)
+    assert crossed.any()
+
+    def line(shape):
+        erase = np.zeros(shape, bool)
+        erase[: shape[0] // 2, int((column + 0.5) / nodes.quality_scale(LENS))] = True
+        return erase
+
+    left = _charts([(_shot(0, line), near)])[2]
+    shown = [uv for one in left for uv in one.uv if uv[:, 0].min() < column < uv[:, 0].max()]
+    assert shown
+    assert min(uv[:, 1].min() for uv in shown) > LENS.height / 2
+
+
 def test_tiles_without_steep_faces_that_images_show_do_without_a_scene(monkeypatch):
     asked = []
     made = occlusion.scene
