@@ -8,10 +8,12 @@ maps it on one core with a mosaic of 2 mm, and prints a line of JSON.
 
 import argparse
 import json
+import multiprocessing
 import resource
 import shutil
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from seamosaic.schemas.parameters import Parameters
@@ -28,7 +30,10 @@ def measure(folder: Path, images: int) -> dict:
     mission, out = folder / f"mission-{images}", folder / "out"
     if not mission.exists():
         survey = {"lines": max(1, round(images**0.5)), "altitude_m": ALTITUDE_M}
-        simulate("reef", mission, seed=5, images=images, width=3648, survey=survey, laser={"brightness": 0.9})
+        scene = {"seed": 5, "images": images, "width": 3648, "survey": survey, "laser": {"brightness": 0.9}}
+        # in a process of its own, whose memory is not that of the run
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            pool.submit(simulate, "reef", mission, **scene).result()
     shutil.rmtree(out, ignore_errors=True)
     parameters = Parameters.model_validate({"mosaic": {"cell_m": 0.002}})
     made = run(str(mission), out, parameters, scheduler="sync")

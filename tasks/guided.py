@@ -17,6 +17,7 @@ from .motion import Motion
 Array = NDArray[Any]
 
 _NEIGHBOURS = 5
+_DEPTHS = 0.0, 1.0  # quantiles between which the depth of a feature is
 _REACH_PX = 12.0  # of the place that the depth around predicts: 1 % of the range at half a base
 _EPIPOLAR_PX = 2.0
 _CANDIDATES = 8
@@ -39,11 +40,13 @@ def match(
     right = known[_in_front(x_a, x_b, known, found)]
     if len(right) < _NEIGHBOURS:
         return known
-    place = _predicted(x_a, x_a[right[:, 0]], x_b[right[:, 1]], found)
+    depth = depths(x_a[right[:, 0]], x_b[right[:, 1]], found.R_i_j, found.t_i_j)[0]
     reach = _REACH_PX / focal_px
+    seen = np.flatnonzero(_may_be_seen(x_a, x_b, np.quantile(depth, _DEPTHS), found, reach))
+    place = _predicted(x_a[seen], x_a[right[:, 0]], depth, found)
     distance, candidate = KDTree(x_b).query(place, k=_CANDIDATES, distance_upper_bound=reach)
     rows, columns = np.nonzero(np.isfinite(distance))
-    candidate = np.asarray(candidate)[rows, columns]
+    rows, candidate = seen[rows], np.asarray(candidate)[rows, columns]
     on_line = np.abs(sampson(x_a[rows], x_b[candidate], found.R_i_j, found.t_i_j)) * focal_px < _EPIPOLAR_PX
     rows, candidate = rows[on_line], candidate[on_line]
     root_a, root_b = unit_root(a.descriptors), unit_root(b.descriptors)
@@ -62,11 +65,21 @@ def _in_front(x_a: Array, x_b: Array, known: NDArray[np.intp], found: Motion) ->
     return np.asarray((depth_a > 0) & (depth_b > 0))
 
 
-def _predicted(x: Array, x_a: Array, x_b: Array, found: Motion) -> Array:
-    """Slopes (N, 2) in image b of features x (N, 2) of image a, as deep as the nearest matches x_a, x_b (K, 2) are."""
-    depth = depths(x_a, x_b, found.R_i_j, found.t_i_j)[0]
+def _may_be_seen(x: Array, x_b: Array, depth: Array, found: Motion, reach: float) -> NDArray[np.bool_]:
+    """Which features x (N, 2) of image a may lie where image b has some, x_b (M, 2), at any of some depths."""
+    low, high = x_b.min(0) - reach, x_b.max(0) + reach
+    places = np.stack([_moved(x, np.full(len(x), Z), found) for Z in depth])
+    return ((places.min(0) < high) & (places.max(0) > low)).all(1)
+
+
+def _predicted(x: Array, x_a: Array, depth: Array, found: Motion) -> Array:
+    """Slopes (N, 2) in image b of features x (N, 2) of image a, as deep as the nearest matches x_a (K, 2) are."""
     nearest = np.asarray(KDTree(x_a).query(x, k=_NEIGHBOURS)[1])
-    Z = np.median(depth[nearest], axis=1)
+    return _moved(x, np.median(depth[nearest], axis=1), found)
+
+
+def _moved(x: Array, Z: Array, found: Motion) -> Array:
+    """Slopes (N, 2) in image b of places x (N, 2) of image a at depths Z (N,)."""
     X_b = (np.column_stack([x, np.ones(len(x))]) * Z[:, None] - found.t_i_j) @ found.R_i_j
     return X_b[:, :2] / np.where(X_b[:, 2:] > 0, X_b[:, 2:], 1e-3)  # behind: far out of the image
 

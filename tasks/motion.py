@@ -89,10 +89,15 @@ def common_plane(X_i: Array, X_j: Array, parameters: MatchParameters) -> Plane |
 
     Soundings of one arm lie on a plane whatever the seabed: on the laser's sheet, which stands steep.
     """
-    planes = [fit_plane(X, parameters.planarity_m) for X in (X_i, X_j)]
-    if any(plane is None or plane.share < parameters.planar_share or plane.normal[2] < _STEEPEST for plane in planes):
+    plane = _seabed_plane(X_i, parameters)
+    return plane if plane is None or _seabed_plane(X_j, parameters) is not None else None
+
+
+def _seabed_plane(X: Array, parameters: MatchParameters) -> Plane | None:
+    plane = fit_plane(X, parameters.planarity_m)
+    if plane is None or plane.share < parameters.planar_share or plane.normal[2] < _STEEPEST:
         return None
-    return planes[0]
+    return plane
 
 
 def estimate(
