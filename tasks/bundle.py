@@ -29,6 +29,7 @@ from .tracks import Sights
 Array = NDArray[Any]
 
 _FIRST_SIGMA_PX, _SIGMA_PX = 0.7, (0.1, 2.0)
+_LEAST_FREEDOM = 0.2  # share of the tie points' that poses leave
 _LEAST_PARALLAX = 0.015  # radians
 # before each round, what is farther off is a wrong match: pixels, but not less than sigmas
 _GATES_PX, _GATE_SIGMAS = (100.0, 10.0, 1.0, 0.5), 5.0
@@ -191,7 +192,7 @@ def refine(
         crossing = _with_crossovers(fixed, block, State(values, poses, X), p)
         values, poses, X = solve(crossing, State(values, poses, X), o, tolerance, afloat)
         residual_px = residuals(poses, sights, x, X) * pixels
-        sigma_px, rough = _noise_px(residual_px, len(X)), laser_ranges.roughness(poses, X, ranges)
+        sigma_px, rough = _noise_px(residual_px, sights), laser_ranges.roughness(poses, X, ranges)
         unknowns = crossovers.LEAST_OF_IMAGE * len(np.union1d(crossed.i, crossed.j))
         bundle = Bundle(poses, block._replace(X=X, roughness=rough), residual_px, sigma_px)
     return bundle if bundle is None or navigation is None else _where_navigation_is(bundle, navigation)
@@ -330,10 +331,17 @@ def _believable(poses: Poses, X: Array, ranges: Ranges, rough: float) -> Ranges:
     return ranges.take(keep)
 
 
-def _noise_px(residual_px: Array, points: int) -> float:
-    """1-sigma of a sight along either axis, from the residuals that the adjustment left."""
+def _noise_px(residual_px: Array, sights: Sights) -> float:
+    """1-sigma of a sight along either axis, from the residuals (M, 2) that the adjustment left.
+
+    Of the four coordinates of a tie point that two images see its own place takes three: only what is left across
+    the epipolar line tells. So each tie point's squares are held against the median of chi squared of its freedom
+    (Wilson & Hilferty 1931); what the images' poses took besides is common to all.
+    """
     if not residual_px.size:
         return _FIRST_SIGMA_PX
-    freedom = max(0.2, 1 - 3 * points / max(1, residual_px.size))
-    spread = _MAD_TO_SIGMA * float(np.median(np.abs(residual_px))) / np.sqrt(freedom)
-    return float(np.clip(spread, *_SIGMA_PX))
+    squares, views = np.bincount(sights.track, (residual_px**2).sum(1)), np.bincount(sights.track)
+    freedom = 2 * views - 3
+    usual = freedom * (1 - 2 / (9 * freedom)) ** 3
+    left = max(_LEAST_FREEDOM, 1 - 6 * len(np.unique(sights.image)) / freedom.sum())
+    return float(np.clip(np.sqrt(np.median(squares / usual) / left), *_SIGMA_PX))
