@@ -42,7 +42,6 @@ _RANGE_GATE = 6.0  # sigmas
 # tell: height, roll and pitch. So many of them hold it.
 _TOLD, _HOLDING = 3, 36
 _SLOPE_SIGMA = 0.03
-_MAD_TO_SIGMA = 1.4826
 _SHIFT_ROUNDS = 20
 
 

@@ -17,7 +17,6 @@ from .motion import Motion
 Array = NDArray[Any]
 
 _NEIGHBOURS = 5
-_DEPTHS = 0.0, 1.0  # quantiles between which the depth of a feature is
 _REACH_PX = 12.0  # of the place that the depth around predicts: 1 % of the range at half a base
 _EPIPOLAR_PX = 2.0
 _CANDIDATES = 8
@@ -42,7 +41,7 @@ def match(
         return known
     depth = depths(x_a[right[:, 0]], x_b[right[:, 1]], found.R_i_j, found.t_i_j)[0]
     reach = _REACH_PX / focal_px
-    seen = np.flatnonzero(_may_be_seen(x_a, x_b, np.quantile(depth, _DEPTHS), found, reach))
+    seen = np.flatnonzero(_may_be_seen(x_a, x_b, (depth.min(), depth.max()), found, reach))
     place = _predicted(x_a[seen], x_a[right[:, 0]], depth, found)
     distance, candidate = KDTree(x_b).query(place, k=_CANDIDATES, distance_upper_bound=reach)
     rows, columns = np.nonzero(np.isfinite(distance))
@@ -65,10 +64,10 @@ def _in_front(x_a: Array, x_b: Array, known: NDArray[np.intp], found: Motion) ->
     return np.asarray((depth_a > 0) & (depth_b > 0))
 
 
-def _may_be_seen(x: Array, x_b: Array, depth: Array, found: Motion, reach: float) -> NDArray[np.bool_]:
-    """Which features x (N, 2) of image a may lie where image b has some, x_b (M, 2), at any of some depths."""
+def _may_be_seen(x: Array, x_b: Array, depths_m: tuple[float, float], found: Motion, reach: float) -> NDArray[np.bool_]:
+    """Which features x (N, 2) of image a may lie where image b has some, x_b (M, 2), between two depths."""
     low, high = x_b.min(0) - reach, x_b.max(0) + reach
-    places = np.stack([_moved(x, np.full(len(x), Z), found) for Z in depth])
+    places = np.stack([_moved(x, np.full(len(x), Z), found) for Z in depths_m])
     return ((places.min(0) < high) & (places.max(0) > low)).all(1)
 
 

@@ -18,7 +18,6 @@ Array = NDArray[np.float64]
 _BLOCK_M, _BLOCK_CELLS, _LEAST_IN_BLOCK = 0.5, 25, 12
 _LEAST_COMPARED = 100
 _USUAL = 1.5  # where the laser says too little: of simulated surveys, 1.1 on even ground to 1.8 on rough
-_JUDGE = 1.0  # of a cell's noise: where the laser's own is more, it tells nothing
 _MOST = 3.0
 _ONE_SIGMA, _TWO_SIGMA = 0.6827, 0.9545
 
@@ -54,10 +53,11 @@ def compare(grid: Grid, matched: Cells, cells: Cells, counted: Grid) -> Beside:
     inner = window(grid, counted)
     both = np.zeros(grid.shape, bool)
     both[inner] = ((cells.source == LASER) & (matched.source == MATCHING))[inner]
-    south, east = np.gradient(matched.elevation, grid.cell_m) if min(grid.shape) > 1 else np.full((2, *grid.shape), 0.0)
+    south, east = np.gradient(matched.elevation, grid.cell_m)
     # both are where their soundings lie on average, which is not the same place
     off = matched.elevation - cells.elevation - east * (matched.x - cells.x) + south * (matched.y - cells.y)
-    row, column = np.nonzero(both & np.isfinite(off) & (cells.noise < _JUDGE * matched.noise))
+    finer = cells.noise < matched.noise  # else the laser tells nothing
+    row, column = np.nonzero(both & np.isfinite(off) & finer)
     across = max(_BLOCK_CELLS, round(_BLOCK_M / grid.cell_m))
     place = np.column_stack([(grid.top - row) // across, (grid.left + column) // across])
     order = np.lexsort(place.T)

@@ -96,11 +96,11 @@ def matched(grid: Grid, cells: Cells, window_m: float = 0.0, noise_scale: float 
     X, Y = cell_centres(grid)
     x, y = (cells.x - X) / grid.cell_m, (cells.y - Y) / grid.cell_m
     z = np.where(cells.source == MATCHING, _without_spikes(cells.elevation), cells.elevation)
-    noise = np.where(cells.density > 0, (np.maximum(cells.noise, 1e-5) / _NOISE_M) ** 2, np.inf)
+    variance = np.where(cells.density > 0, (np.maximum(cells.noise, 1e-5) / _NOISE_M) ** 2, np.inf)
     rim = _RADII[-1]
     u, v = (np.pad(np.nan_to_num(values), rim).ravel().astype(np.float32) for values in (x, y))
     heights = np.pad(np.nan_to_num(z), rim).ravel()
-    variance = np.pad(noise, rim, constant_values=np.inf).ravel().astype(np.float32)
+    variance = np.pad(variance, rim, constant_values=np.inf).ravel().astype(np.float32)
     width = grid.width + 2 * rim
     around = _Around(width, u, v, 1 / variance, heights, variance, np.zeros_like(variance))
     here = (wanted // grid.width + rim) * width + wanted % grid.width + rim

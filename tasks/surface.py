@@ -18,7 +18,6 @@ from scipy.spatial import Delaunay
 
 from .gridding import INTERPOLATED, Cells
 from .grids import Grid, cell_centres, window
-from .smooth import REACH
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -79,8 +78,8 @@ class _Reach(NamedTuple):
 
 
 def halo_cells(max_distance_m: float, cell_m: float) -> int:
-    """Rim that a tile needs for its surface, of cells that are smoothed, to be that of the whole map."""
-    return math.ceil(2 * max_distance_m / cell_m) + 2 * _RIM_CELLS + 1 + REACH
+    """Rim that a tile needs for its surface to be that of the whole map."""
+    return math.ceil(2 * max_distance_m / cell_m) + 2 * _RIM_CELLS + 1
 
 
 def _dense(cells: Cells, depth: int) -> Mask:

@@ -254,17 +254,16 @@ def _surface(
             "gives links their scale): there is nothing to map. Look whether images overlap, and at the laser in "
             "calibration.yaml and in the parameters"
         )
-    halo = maps.surface.halo_cells(m.max_interpolation_m, m.cell_m)
     sounded = [(*one, done) for one, done in zip(seen, cells, strict=True) if done.info["sounded"]]
     placed = _Placed([(tile, done) for tile, _, done in sounded])
     every = -(-len(sounded) // max(1, _GROWTH_CELLS // (size * size)))
     samples = [
-        maps.Sample(tile, placed.overlapping(grids.pad(tile, halo)), outlines[[image.row for image in touching]])
+        maps.Sample(tile, placed.overlapping(maps.with_halo(m, tile)), outlines[[image.row for image in touching]])
         for tile, touching, _ in sounded[::every]
     ]
     task = delayed(maps.fit_growth)(m, samples, dask_key_name=state.key(f"growth-{m.cell_m:g}"))
     (growth,) = compute(state, maps.GROWTH, [task])
-    around = [(tile, placed.overlapping(grids.pad(tile, halo))) for tile in tiles]
+    around = [(tile, placed.overlapping(maps.with_halo(m, tile))) for tile in tiles]
     around = [(tile, near) for tile, near in around if near]  # no others get a value
     surface_tasks = [
         delayed(maps.surface_tile)(m, tile, near, growth, dask_key_name=state.key(f"surface-{m.cell_m:g}", k))

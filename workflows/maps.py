@@ -154,12 +154,12 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
         held = []
         scale = round(matching_noise.noise_scale(_beside(m, samples)), 4)
         for sample in samples:  # twice over all of them, so that one is held at a time
-            halo = _halo(m, sample.tile)
+            halo = with_halo(m, sample.tile)
             held.append(surface.hold_out(halo, _cells(m.job, halo, sample.neighbours, scale), reach, sample.tile))
         law = surface.fit_growth(surface.Holdout(*(np.concatenate(column) for column in zip(*held, strict=True))))
         sigma = [np.zeros(0)]
         for sample in samples:
-            halo = _halo(m, sample.tile)
+            halo = with_halo(m, sample.tile)
             known, inner = _cells(m.job, halo, sample.neighbours, scale), grids.window(halo, sample.tile)
             found = surface.delaunay_surface(halo, known, m.max_interpolation_m, law, sample.tile)
             seen = surface.seen(sample.tile, sample.outlines)
@@ -181,14 +181,15 @@ def _beside(m: MapJob, samples: Sequence[Sample]) -> matching_noise.Beside:
         beside = _gridded(m.job, halo, sample.neighbours, _BESIDE)
         if beside.density.any():
             cells = _gridded(m.job, halo, sample.neighbours)
-            beside = matching_noise.instead_of_laser(cells, beside)
-            matched = smooth.matched(halo, beside, _window_m(sample.neighbours))
+            alone = matching_noise.instead_of_laser(cells, beside)
+            matched = smooth.matched(halo, alone, _window_m(sample.neighbours))
             found.append(matching_noise.compare(halo, matched, cells, sample.tile))
     return matching_noise.Beside(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
-def _halo(m: MapJob, tile: Grid) -> Grid:
-    return grids.pad(tile, surface.halo_cells(m.max_interpolation_m, tile.cell_m))
+def with_halo(m: MapJob, tile: Grid) -> Grid:
+    """A tile with the cells around it that its surface depends on, and what these, smoothed, depend on."""
+    return grids.pad(tile, surface.halo_cells(m.max_interpolation_m, tile.cell_m) + smooth.REACH)
 
 
 def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]], growth: Done) -> Done:
@@ -197,7 +198,7 @@ def surface_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]],
     inputs, scale = [done.key for _, done in neighbours], growth.info["noise_scale"]
 
     def make() -> Made:
-        halo = _halo(m, tile)
+        halo = with_halo(m, tile)
         cells = _cells(m.job, halo, neighbours, scale)
         found = surface.delaunay_surface(halo, cells, m.max_interpolation_m, law, tile)
         mapped = surface.without_guesses(found, worst)

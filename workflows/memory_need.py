@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 from ..schemas.calibration import Camera
 from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
-from ..tasks import grids
+from ..tasks import grids, smooth
 from ..tasks.camera import ground_sample_distance
 from ..tasks.surface import halo_cells
 
@@ -44,7 +44,7 @@ def needs(camera: Camera, parameters: Parameters, images: int, range_m: float, f
     cell = min(usual, planned_cell_m(camera, parameters, range_m))
     across = parameters.grid.max_interpolation_m
     reach = grids.max_interpolation_m(range_m) if across == "auto" else float(across)
-    side = parameters.grid.tile_cells + 2 * halo_cells(reach, cell)
+    side = parameters.grid.tile_cells + 2 * (halo_cells(reach, cell) + smooth.REACH)
     texels = parameters.mosaic.tile_cells
     image = _PROCESS + max(_EACH_PIXEL * pixels + file_bytes, _EACH_DECODED * pixels + 2 * file_bytes)
     return [

@@ -91,8 +91,8 @@ def leaf(
         steep = _Steep(m, images, solution.poses, light, relief, mosaic_cell_m)
         return _made(place, z[inner], slopes, made, ortho, made.error_m, steep)
 
-    place_of = [list(place), list(own), m.hiding_m, *context(m, tile)]
-    parameters = [*place_of, mosaic_cell_m, *stage(m.job.parameters.mosaic)]
+    parameters = [list(place), list(own), m.hiding_m, mosaic_cell_m]
+    parameters += [*context(m, tile), *stage(m.job.parameters.mosaic)]
     return once(m.job, MESH, _VERSION, inputs, parameters, make, ("z", "slopes", "nodes", "heights", "triangles", "uv"))
 
 
