@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from seamosaic.tasks import dense_refine
 from seamosaic.tasks.dense_refine import refine
 
 SHAPE = 160, 200
@@ -60,7 +61,16 @@ def test_sigma_is_what_noise_makes():
     error = np.nanstd(_inner(found.disparity) - 6.4)
     assert 0.5 < np.median(_inner(found.sigma_px)) / error < 1.5
     quiet = refine(start, *_pair(lambda x, y: 6.4 + 0 * x))
-    assert np.median(quiet.sigma_px) < 0.3 * np.median(found.sigma_px)
+    assert np.nanmedian(quiet.sigma_px) < 0.3 * np.nanmedian(found.sigma_px)
+
+
+def test_noise_does_not_grow_from_round_to_round(monkeypatch):
+    """What errs in one pixel errs against its neighbours, which a box of all of them would make larger each time."""
+    start, pair = np.full(SHAPE, 6, np.float32), _pair(lambda x, y: 6.4 + 0 * x, noise=6)
+    few = np.std(_inner(refine(start, *pair).disparity))
+    monkeypatch.setattr(dense_refine, "_ROUNDS", 20)
+    many = np.std(_inner(refine(start, *pair).disparity))
+    assert 0.8 * few < many < 1.1 * few
 
 
 def test_what_was_not_matched_or_has_no_texture_or_goes_elsewhere_is_left_out():
