@@ -31,7 +31,7 @@ _LEAST_CONTRAST = 1.5  # grey levels, standard deviation of what counts as textu
 _DARK, _BRIGHT = 2, 250
 _SPECKLE_PX, _SPECKLE_STEP = 120, 2  # smaller islands of disparity go; an island ends where disparity jumps by so much
 _RIM_PX = 2  # beside what could not be matched
-_ENOUGH_PX = 5.0  # rectified pixels across a cell, of which every second one each way says enough
+_ENOUGH_PX = 4.0  # rectified pixels across a cell, of which every second one each way says enough
 
 
 class Rectified(NamedTuple):

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from .gridding import group_index, group_median
+from .gridding import group_index, group_median, ranked
 
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]
@@ -49,10 +49,12 @@ def reduce_to_cells(
 
     known_map : (K, 3) laser and tie points around. points_a_cell : that a cell can have.
     """
+    if not len(X_map):
+        return NO_CELLS
     column, row = np.floor(X_map[:, :2] / cell_m).astype(np.int64).T
-    key = (row << 32) + column
-    order = np.lexsort((X_map[:, 2], key))
-    group = group_index(key[order])
+    cell = (row - row.min()) * (np.ptp(column) + 1) + column - column.min()
+    order = ranked(cell, X_map[:, 2])
+    group = group_index(cell[order])
     count = np.bincount(group)
     enough = count >= min(_LEAST_POINTS, points_a_cell / 2)
     order, group = order[enough[group]], group_index(group[enough[group]])

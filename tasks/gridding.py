@@ -4,6 +4,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from .grids import Grid, index_of, inside
 
@@ -132,16 +133,26 @@ def group_index(keys: Indices) -> Indices:
     return np.concatenate([[0], np.cumsum(new if new.ndim == 1 else new.any(1))]).astype(np.int64)[: len(keys)]
 
 
+def ranked(group: Indices, values: Array) -> Indices:
+    """Order (N,) by group, numbered from 0, then by value: that of `numpy.lexsort`, several times faster."""
+    rising, count = np.argsort(values), len(values)
+    if not count:
+        return rising
+    # the rows of a sparse matrix keep the order in which their entries come
+    entries = rising, (group[rising], np.arange(count))
+    return np.asarray(coo_array(entries, shape=(int(group.max()) + 1, count)).tocsr().data, np.int64)
+
+
 def group_median(group: Indices, values: Array) -> Array:
     """Median (G,) of values (N,) in each group 0..G-1 (N,)."""
-    ranked, start, count = _ranked(group, values)
-    return (ranked[start + (count - 1) // 2] + ranked[start + count // 2]) / 2
+    rising, start, count = _rising(group, values)
+    return (rising[start + (count - 1) // 2] + rising[start + count // 2]) / 2
 
 
-def _ranked(group: Indices, values: Array) -> tuple[Array, Indices, Indices]:
+def _rising(group: Indices, values: Array) -> tuple[Array, Indices, Indices]:
     """Values (N,) in rising order group by group, and each group's start and count, (G,)."""
     count = np.bincount(group)
-    return values[np.lexsort((values, group))], np.cumsum(count) - count, count
+    return values[ranked(group, values)], np.cumsum(count) - count, count
 
 
 def _outliers(placed: _Sorted) -> NDArray[np.bool_]:
@@ -155,8 +166,8 @@ def _outliers(placed: _Sorted) -> NDArray[np.bool_]:
     soundings, group = placed.soundings, group_index(placed.cell)
     z = soundings.X[:, 2]
     departure = np.abs(z - group_median(group, z)[group])
-    ranked, start, count = _ranked(group, departure)
-    spread = ranked[start + (2 * count + 2) // 3 - 1] / _TWO_THIRDS_OF_SIGMA
+    rising, start, count = _rising(group, departure)
+    spread = rising[start + (2 * count + 2) // 3 - 1] / _TWO_THIRDS_OF_SIGMA
     expected = np.hypot(soundings.sigma, soundings.pose_sigma)
     # two soundings cannot say which of them is wrong
     return (departure > _OUTLIER_SIGMAS * np.maximum(spread[group], expected)) & (count[group] > 2)

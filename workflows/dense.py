@@ -19,7 +19,7 @@ TIES, STEP, AGREEMENT = "ties", "dense", "agreement"
 _VERSION = code_version(sys.modules[__name__])
 _WIDTH_PX = 1200  # of the images that are matched, at most; they are at least halved
 _DEPTH_SHARE = 0.005  # of what is known of the depth is left out at either end
-_DEPTH_MARGIN = 0.08  # of the depth
+_DEPTH_MARGIN, _SPREAD_MARGIN = 0.02, 0.3  # of the depth, and of how much it varies
 _IMAGES_KEPT = 4
 _WITHIN_CELLS = 0.5
 # where no laser tells: half a pixel of dense matching, which is on smaller images, and one of tie points
@@ -95,7 +95,7 @@ def _make(m: MapJob, pair: DensePair, solution: Solution, view: _Views) -> Made:
         return nothing
     depth = (known - poses.C_local[i]) @ axes[:, 2]
     least, most = np.quantile(depth, (_DEPTH_SHARE, 1 - _DEPTH_SHARE))
-    margin = _DEPTH_MARGIN * float(np.median(depth))
+    margin = _DEPTH_MARGIN * float(np.median(depth)) + _SPREAD_MARGIN * (most - least)
     scale = _scale(m)
     made = dense.rectify(camera, poses, i, j, (max(least - margin, 0.2), most + margin), 1 / scale)
     if made is None:
