@@ -113,4 +113,4 @@ def test_pairs_that_say_nothing_of_depth_are_refused():
 
 
 def test_small_cells_get_every_point_that_there_is():
-    assert [dense.spacing(pixels) for pixels in (1.5, 4.9, 5.0, 20.0)] == [1, 1, 2, 2]
+    assert [dense.spacing(pixels) for pixels in (1.5, 3.9, 4.0, 20.0)] == [1, 1, 2, 2]
