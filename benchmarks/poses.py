@@ -1,10 +1,10 @@
 """Poses beside pycolmap on the same images: `python benchmarks/poses.py MISSION ...` (simulated, with their truth).
 
 Needs pycolmap, which is no dependency of seamosaic: `pip install pycolmap` into the same environment. Either program
-runs in a process of its own on one thread; its processor time is counted from the first image to the last pose,
-without imports. pycolmap has the camera of calibration.yaml, held, and the positions of navigation as priors of
-their stated sigma, all else is its default. Accuracy: camera centres after a rigid alignment with the truth, of the
-images that are placed.
+runs in a process of its own on one thread, with the environment of a run's workers; its processor time is counted from
+the first image to the last pose, without imports. pycolmap has the camera of calibration.yaml, held, and the positions
+of navigation as priors of their stated sigma, all else is its default. Accuracy: camera centres after a rigid alignment
+with the truth, of the images that are placed.
 """
 
 import argparse
@@ -22,12 +22,13 @@ from seamosaic.catalog.store import Store
 from seamosaic.schemas.calibration import Camera
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.tasks.evaluation import trajectory_errors
-from seamosaic.workflows import plan, run
+from seamosaic.workflows import heap, plan, run
 from seamosaic.workflows.executor import open_executor
 from seamosaic.workflows.job import Job
 from seamosaic.workflows.session import Ledger, Session
 
-_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+_ENVIRONMENT |= {name: str(value) for name, value in heap.WORKER_ENVIRONMENT.items()}
 
 
 def ours(opened: OpenedMission, mission: Path, folder: Path) -> dict[str, list[float]]:
@@ -105,7 +106,7 @@ def child(which: str, mission: Path) -> None:
 
 def measure(which: str, mission: Path) -> float:
     command = [sys.executable, __file__, "--only", which, str(mission)]
-    done = subprocess.run(command, env={**os.environ, **_ONE_THREAD}, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env={**os.environ, **_ENVIRONMENT}, capture_output=True, text=True, check=False)
     if done.returncode:
         print(f"{mission.name} {which}: {done.stderr.strip().splitlines()[-1]}")
         return float("nan")

@@ -74,12 +74,10 @@ class Crossovers(NamedTuple):
 
 def lines(soundings: Mapping[int, tuple[Array, Array]]) -> Lines:
     """The lines of the images with a laser: soundings (L, 3), camera frame, and the arm (L,) of each."""
-    parts = [_nodes(k, *own) for k, own in sorted(soundings.items()) if len(own[0])]
-    if not parts:
-        none = np.zeros(0, np.intp)
-        return Lines(none, none, np.zeros((0, 3)), np.zeros(0), 0.0)
+    parts = [(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros(0))]
+    parts += [_nodes(k, *own) for k, own in sorted(soundings.items()) if len(own[0])]
     image, arm, X, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
-    length = _PIECE * np.sqrt(2.0) * float(np.median(X[:, 2]))
+    length = _PIECE * np.sqrt(2.0) * float(np.median(X[:, 2])) if len(X) else 0.0
     return Lines(image, arm, X, sigma, _LONGEST_PIECES * length)
 
 

@@ -53,7 +53,7 @@ def slopes(X: Array, tree: KDTree) -> tuple[Array, Array]:
 
     Its rise to the east and north (N, 2), and how far the farthest of these neighbours is (N,).
     """
-    distance, nearest = (np.asarray(found) for found in tree.query(X[:, :2], k=_NEIGHBOURS))
+    distance, nearest = (np.asarray(found) for found in tree.query(X[:, :2], k=_NEIGHBOURS, workers=-1))
     around = X[nearest] - X[nearest].mean(1, keepdims=True)
     xy, z = around[:, :, :2], around[:, :, 2]
     normal = np.einsum("nki,nkj->nij", xy, xy)

@@ -62,9 +62,10 @@ def test_an_image_is_held_if_nearly_all_of_its_crossings_agree():
     assert not crossovers.holds(found, found, 3).any()
 
 
-def test_no_soundings_no_lines():
+@pytest.mark.parametrize("soundings", [{}, {0: (np.array([[0.1, 0.2, 3.0]]), np.array([0]))}])
+def test_few_soundings_make_no_lines(soundings):
     poses, _ = _pair()
-    none = crossovers.find(poses, crossovers.lines({}))
+    none = crossovers.find(poses, crossovers.lines(soundings))
     assert len(crossovers.believable(none, 0).i) == 0
     assert not crossovers.holds(none, none, 2).any()
 
