@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..schemas.calibration import Camera
 from ..schemas.parameters import AdjustParameters
-from . import crossovers, laser_ranges
+from . import crossovers, laser_ranges, tracks
 from . import residuals as remaining
 from .adjust import Adjusted, sigmas
 from .camera import focal_px, normalised
@@ -34,6 +34,7 @@ _LEAST_PARALLAX = 0.015  # radians
 # before each round, what is farther off is a wrong match: pixels, but not less than sigmas
 _GATES_PX, _GATE_SIGMAS = (100.0, 10.0, 1.0, 0.5), 5.0
 _TOLERANCES = 1e-2, 1e-2, 1e-3, 3e-4  # of each round: what the next one changes anyhow need not be found to the end
+_FIRST_ROUNDS = 2  # these have a few tie points of an image only: the longest track of each cell twice as wide
 _LEAST_SIGHTS = 4  # of an image that tie points hold: three leave several poses
 _COVARIANCE_SIGMA_PX = 1.0  # of sights, for the covariances: what calibration leaves is shared by many
 _RANGE_GATE = 6.0  # sigmas
@@ -170,10 +171,14 @@ def refine(
     depth = float(np.median([np.median(own[:, 2]) for own in lit.values()])) if lit else 3.0
     sights = sights.take(start.known[sights.image])
     fixed = _fixed(start, navigation)
-    bundle, poses, unknowns, values = None, start, 0, first_values(fixed, start)
+    bundle, poses, unknowns, values, every = None, start, 0, first_values(fixed, start), sights
     sigma_px, rough = _FIRST_SIGMA_PX, laser_ranges.FIRST_ROUGHNESS
-    for gate_px, tolerance in zip(_GATES_PX, _TOLERANCES, strict=True):
+    if navigation is not None:  # without, each image must be held from the start
+        sights = tracks.thin(sights, (camera.height, camera.width), -(-p.tie_cells // 2), 1)
+    for number, (gate_px, tolerance) in enumerate(zip(_GATES_PX, _TOLERANCES, strict=True)):
         gate_px = max(gate_px, _GATE_SIGMAS * sigma_px)
+        if number == _FIRST_ROUNDS and navigation is not None:
+            sights = every
         sights, x, X, pixels = _inliers(camera, poses, sights, depth, gate_px)
         crossed = crossovers.believable(crossovers.find(poses, lines), unknowns)
         if not len(X) and not len(crossed.i):

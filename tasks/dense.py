@@ -182,9 +182,9 @@ def warp(made: Rectified, seen: Sight, grey: Pixels, erase: Mask, scale: int) ->
 
     grey, erase : (H / scale, W / scale) the image and which of its pixels the laser lights.
     """
-    uv = (upsample(seen.uv, _STEP)[: made.shape[0], : made.shape[1]] + 0.5) / scale - 0.5
-    uv = np.nan_to_num(uv, nan=-9.0)
-    u, v = np.ascontiguousarray(uv[..., 0]), np.ascontiguousarray(uv[..., 1])
+    u, v = cv2.split(upsample((seen.uv + 0.5) / scale - 0.5, _STEP)[: made.shape[0], : made.shape[1]])
+    for place in (u, v):
+        cv2.patchNaNs(place, -9.0)
     pixels = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[0])
     unseen = np.pad((erase | (grey >= _BRIGHT) | (grey < _DARK)).astype(np.uint8), 1, constant_values=1)
     hidden = cv2.remap(unseen, u + 1, v + 1, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=[1])
@@ -195,13 +195,12 @@ def warp(made: Rectified, seen: Sight, grey: Pixels, erase: Mask, scale: int) ->
 def _evened(pixels: Pixels, usable: Mask) -> tuple[Pixels, Mask]:
     """Local mean 128 and local contrast the same everywhere, by usable pixels alone; plain where there are none."""
     known, size = usable.astype(np.float32), (_CONTRAST_PX, _CONTRAST_PX)
-    level = np.where(usable, pixels, 0).astype(np.float32)
+    level = pixels * known
     weight = np.maximum(cv2.blur(known, size), 1e-3)
     mean = cv2.blur(level, size) / weight
-    variance = np.maximum(cv2.blur(level * level, size) / weight - mean * mean, 0)
-    contrast = np.sqrt(variance)
-    even = 128 + 48 * (level - mean) / np.maximum(contrast, _LEAST_CONTRAST)
-    return np.where(usable, np.clip(even, 0, 255), 128).astype(np.uint8), usable & (contrast > _LEAST_CONTRAST)
+    contrast = np.sqrt(np.maximum(cv2.blur(level * level, size) / weight - mean * mean, 0))
+    even = (level - mean) * (48 * known / np.maximum(contrast, _LEAST_CONTRAST)) + 128
+    return np.clip(even, 0, 255).astype(np.uint8), usable & (contrast > _LEAST_CONTRAST)
 
 
 def disparity(made: Rectified, first: tuple[Pixels, Mask], second: tuple[Pixels, Mask]) -> Array:

@@ -20,7 +20,7 @@ _VERSION = code_version(sys.modules[__name__])
 _WIDTH_PX = 1200  # of the images that are matched, at most; they are at least halved
 _DEPTH_SHARE = 0.005  # of what is known of the depth is left out at either end
 _DEPTH_MARGIN, _SPREAD_MARGIN = 0.02, 0.3  # of the depth, and of how much it varies
-_IMAGES_KEPT = 4
+_IMAGES_KEPT = 12
 _WITHIN_CELLS = 0.5
 # where no laser tells: half a pixel of dense matching, which is on smaller images, and one of tie points
 _DENSE_PX, _TIE_PX, _UNKNOWN_M = 0.5, 1.0, 1.0

@@ -22,7 +22,7 @@ _RELIEF_SHARE = 0.3
 _HIDING = 0.5  # of the range: terrain of two thirds of it hides what is so far behind it from an image's corner
 _WORST_SIGMA = 1 / 75  # of the range: what interpolation knows less of it does not know
 _LEAST_SEEN = 0.91  # of the ground that images see: where that is mapped, what is less certain stays empty
-_TIES_A_BATCH, _PAIRS_A_BATCH = 64, 8
+_TIES_A_BATCH, _PAIRS_A_BATCH = 64, 16
 _AGREEMENT_PAIRS = 60
 
 
