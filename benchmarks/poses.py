@@ -27,8 +27,7 @@ from seamosaic.workflows.executor import open_executor
 from seamosaic.workflows.job import Job
 from seamosaic.workflows.session import Ledger, Session
 
-_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-_ENVIRONMENT |= {name: str(value) for name, value in heap.WORKER_ENVIRONMENT.items()}
+_ENVIRONMENT = {**heap.WORKER_ENVIRONMENT, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def ours(opened: OpenedMission, mission: Path, folder: Path) -> dict[str, list[float]]:

@@ -132,8 +132,7 @@ def run(count: int) -> float:
 
 if __name__ == "__main__":
     if not WORKER_ENVIRONMENT.keys() <= os.environ.keys():
-        environment = {name: str(value) for name, value in WORKER_ENVIRONMENT.items()}
-        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **environment})
+        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **WORKER_ENVIRONMENT})
     sizes = sorted(int(a) for a in sys.argv[1:]) or [1000, 10_000]  # the peak of memory is that of all so far
     seconds = [run(size) for size in sizes]
     for (n, before), (m, after) in itertools.pairwise(zip(sizes, seconds, strict=True)):

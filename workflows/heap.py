@@ -10,7 +10,10 @@ from contextlib import suppress
 from typing import Final
 
 # glibc's; setting one of the two alone lowers the other
-WORKER_ENVIRONMENT: Final = {"MALLOC_TRIM_THRESHOLD_": 256 * 2**20, "MALLOC_MMAP_THRESHOLD_": 64 * 2**20}
+WORKER_ENVIRONMENT: Final = {
+    "MALLOC_TRIM_THRESHOLD_": str(256 * 2**20),
+    "MALLOC_MMAP_THRESHOLD_": str(64 * 2**20),
+}
 
 
 def give_back() -> None:

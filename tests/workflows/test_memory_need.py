@@ -61,7 +61,6 @@ def test_check_says_it(tiny_mission):
 
 RUN = """\
 import sys
-from pathlib import Path
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.workflows.run import run
 if __name__ == "__main__":
