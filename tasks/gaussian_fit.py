@@ -22,7 +22,9 @@ WINDOW: Final = 4.5
 GROUND: Final = 3.2
 FIT: Final = 3.0
 # Where the crest is clipped, height and width are told by the flanks, and slowly.
-_STEPS, _STEPS_CLIPPED = 2, 6
+_STEPS, _STEPS_CLIPPED = 2, 4
+# Light, of the brightest that is not clipped, that tells of the flanks.
+_FLANK: Final = 0.15
 # Rows over which ground, width and noise are averaged.
 _GROUND_ROWS, _WIDTH_ROWS, _NOISE_ROWS = 9, 41, 31
 # Bands of height, of the usual line's, in which the noise is measured, in so many profiles.
@@ -95,7 +97,9 @@ def fit(light: Floats, mask: Floats, width: float, floor: float) -> Fit:
     core = slice(half - reach, half + reach + 1)
     state = _first(light[core], x[core], width)
     noise = _Noise(floor, 0.0, 0.0, max(median(state.height), 1e-9))
-    steps = _STEPS if np.count_nonzero(mask[half]) > 0.5 * mask.shape[1] else _STEPS_CLIPPED
+    steps = _STEPS
+    if np.count_nonzero(mask[half]) < 0.5 * mask.shape[1]:
+        steps, state = _STEPS_CLIPPED, _by_flanks(state, light[core], mask[core], x[core])
     for k in range(steps):
         state = _improved(state, light[core], mask[core], x[core], noise, last=k == steps - 1)
         if k == steps - 2:
@@ -173,6 +177,23 @@ def _first(light: Floats, x: Floats, width: float) -> _State:
     step = np.clip(dp / dd / height, -1, 1)
     place = np.clip(start * step, x[0], x[-1])
     return _State(place, _wider(start, height, sums), height, (gp, gp, gp))
+
+
+def _by_flanks(state: _State, light: Floats, mask: Floats, x: Floats) -> _State:
+    """Width and height, one for all, of a line whose crest is clipped: a Gaussian's logarithm is a parabola."""
+    some = slice(None, None, max(1, mask.shape[1] // (4 * _SAMPLES)))
+    part, square = light[:, some], (x - state.place[some]) ** 2
+    seen = (mask[:, some] > 0) & (square < (FIT * state.width[some]) ** 2)
+    seen &= part > _FLANK * max(float(part[seen].max(initial=0)), 1e-6)
+    weight, square = part[seen], square[seen]
+    if len(weight) < 20:
+        return state
+    # the logarithm's sigma is the light's over the light
+    slope, top = np.polyfit(square, np.log(weight), 1, w=weight)
+    width = np.sqrt(-0.5 / slope) if slope < 0 else np.inf
+    width = np.clip(width, 0.4 * state.width, state.width)
+    height = np.full_like(state.height, np.exp(min(top, 5.0)))
+    return state._replace(width=width.astype(np.float32), height=height)
 
 
 class _Sums(NamedTuple):

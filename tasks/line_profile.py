@@ -265,7 +265,7 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     if (crest.reshape(len(crest), -1).max(axis=1) >= _CLIPPED).mean() > _GLARING:
         # the flanks of a clipped line are narrow
         columns = 1
-    half = int(np.ceil(gaussian_fit.WINDOW * 1.1 * width / columns)) + 1
+    half = int(np.ceil(gaussian_fit.WINDOW * width / columns)) + 1
     level, inside = _strip(image, rows.v, centre, half * columns + columns // 2)
     green, shine = _green(level), np.asarray(cv2.LUT(level, linear), np.float32)
     mask, unclipped = _all(inside, columns).astype(np.float32), _all(green < _CLIPPED, columns)
@@ -285,7 +285,7 @@ def _fit(image: NDArray[np.uint8], rows: _Rows, box_px: float, linear: Floats) -
     strange |= (share < _FADING) & unclipped[half] & (to_end <= width)
     sigma = np.hypot(sigma, _EDGE * width * np.exp(-0.5 * to_end / width))
     if image.ndim == 2:
-        usual = running_median(found.width, max(len(found.width) // 3, 33), 64)
+        usual = running_median(found.width, max(len(found.width) // 3, 33))
         strange |= _unlike_the_rest(found, gaussian_fit.misfit(light, mask * unclipped, found, usual, floor))
     fit = _accepted(_Fit(np.where(strange, np.nan, u), sigma, width, found.signal_to_noise), rows, image.shape[1])
     return fit if image.ndim == 3 else fit._replace(u=np.where(_short(rows.v, fit), np.nan, fit.u))
@@ -300,7 +300,7 @@ def _unlike_the_rest(found: gaussian_fit.Fit, misfit: NDArray) -> NDArray[np.boo
     misfit : (N,) scatter squared that Gaussians of the usual width leave.
     """
     rows = len(misfit)
-    stops = np.log2(misfit / running_median(misfit, max(rows // 3, 33), 64) + 1e-3)
+    stops = np.log2(misfit / running_median(misfit, max(rows // 3, 33)) + 1e-3)
     # bubbles are in the upper half only
     odd = stops > _ODD * (median(stops) - float(np.quantile(stops, 0.16)))
     stops = np.abs(np.log2(np.maximum(found.height / median(found.height), 1e-3)))

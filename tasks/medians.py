@@ -13,12 +13,10 @@ def median(values: NDArray) -> float:
     return float(np.partition(values, middle, axis=None)[middle])
 
 
-def running_median(height: NDArray, rows: int = 33, most: float = 1.0) -> Array:
-    """Running median (N,) of heights, over so many rows, to a sixteenth of a stop.
-
-    most : heights beyond it count as it.
-    """
-    every, top = max(1, rows // 8), 255 - 16 * np.log2(most)
-    steps = np.minimum(np.maximum(16 * np.log2(np.maximum(height, 1e-6)) + top, 0), 255).astype(np.uint8)
+def running_median(height: NDArray, rows: int = 33) -> Array:
+    """Running median (N,) of heights, over so many rows, to a sixteenth of a stop, eight stops around the median."""
+    every, middle = max(1, rows // 8), max(median(height), 1e-9)
+    stops = np.log2(np.maximum(height * (1 / middle), 1e-3))
+    steps = np.clip(16 * stops + 128, 0, 255).astype(np.uint8)
     usual = cv2.medianBlur(steps[::every, None], 9).ravel()
-    return np.repeat(2 ** ((usual.astype(float) - top) / 16), every)[: len(height)]
+    return np.repeat(middle * 2 ** ((usual.astype(float) - 128) / 16), every)[: len(height)]

@@ -55,14 +55,17 @@ def test_recall_and_precision_of_faint_lines(snr: float, recall: float, precisio
         assert recall <= right.sum() / visible(made) < 1.03
 
 
-def test_a_saturated_line_is_measured_by_its_flanks():
-    made = scene(150, noise=0.012)
+@pytest.mark.parametrize(("height", "width_px"), [(1.8, 1.8), (2.4, 5.0), (4.8, 1.8), (4.8, 5.0)])
+def test_a_saturated_line_is_measured_by_its_flanks(height: float, width_px: float):
+    made = scene(height / 0.012, width_px=width_px)
     line = measured(made)
     assert (made.image[..., 1] == 255).sum() > 3 * made.camera.height
     error = errors(line, made)
     assert len(line.uv) > 0.95 * visible(made)
-    assert abs(error.mean()) < 0.02
-    assert 0.005 < error.std() < 0.15
+    assert abs(np.median(error)) < 0.01
+    # beside the crossing the other arm hides a flank, and sigma says so
+    assert 0.005 < 1.4826 * np.median(np.abs(error)) < 0.06
+    assert 0.85 < (error / line.sigma_px).std() < 1.15
 
 
 def test_a_sloping_ground_does_not_draw_the_line():
