@@ -391,7 +391,8 @@ def _left_out(x: Array, p: _Problem, corner: NDArray, laser: NDArray) -> tuple[A
             if len(np.unique(lit[own & (lit != k)])) < 2:
                 continue
             sheets[k, s] = state.sheets[s]
-            here = own & (lit == k)
+            # also the points that the adjustment rejected: that they are far off is to be seen
+            here = (p.data.laser_sheet == s) & (lit == k)
             if here.any():
                 X = cast_rays(*rays(state.camera, p.data.laser_uv[here]), state.sheets[s])
                 off[here] = _above(state, int(k), X)

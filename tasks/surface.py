@@ -231,6 +231,31 @@ def delaunay_surface(
     return Surface(elevation, sigma, source)
 
 
+class Guesses(NamedTuple):
+    """What the sigma of interpolated cells comes from, (height, width) each: 0 where sounded, NaN where none reaches.
+
+    Attributes
+    ----------
+    own_m : sigma of the corners.
+    distance_m, spread_m : what `growth_sigma` wants.
+    """
+
+    own_m: Array
+    distance_m: Array
+    spread_m: Array
+
+
+def guesses(grid: Grid, cells: Cells, max_distance_m: float, counted: Grid | None = None) -> Guesses:
+    """What `delaunay_surface` interpolates from, before it is known how interpolation errs."""
+    empty = cells.density == 0
+    reach = _reach(grid, cells, empty & _inside(grid, counted), max_distance_m)
+    _, own, spread = _interpolated(cells, reach)
+    found = Guesses(*(np.where(empty, np.nan, 0.0) for _ in Guesses._fields))
+    for layer, values in zip(found, (own, reach.distance, spread), strict=True):
+        layer.ravel()[reach.cell] = values
+    return found
+
+
 def without_guesses(surface: Surface, max_sigma_m: float) -> Surface:
     """The surface without interpolated cells whose sigma is larger: a guess is no map."""
     guess = (surface.source == INTERPOLATED) & (surface.sigma > max_sigma_m)

@@ -150,21 +150,19 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
     """
 
     def make() -> Made:
-        reach = m.max_interpolation_m
-        held = []
+        reach, held, guessed = m.max_interpolation_m, [], []
         scale = round(matching_noise.noise_scale(_beside(m, samples)), 4)
-        for sample in samples:  # twice over all of them, so that one is held at a time
-            halo = with_halo(m, sample.tile)
-            held.append(surface.hold_out(halo, _cells(m.job, halo, sample.neighbours, scale), reach, sample.tile))
-        law = surface.fit_growth(surface.Holdout(*(np.concatenate(column) for column in zip(*held, strict=True))))
-        sigma = [np.zeros(0)]
         for sample in samples:
             halo = with_halo(m, sample.tile)
             known, inner = _cells(m.job, halo, sample.neighbours, scale), grids.window(halo, sample.tile)
-            found = surface.delaunay_surface(halo, known, m.max_interpolation_m, law, sample.tile)
+            held.append(surface.hold_out(halo, known, reach, sample.tile))
+            guesses = surface.guesses(halo, known, reach, sample.tile)
             seen = surface.seen(sample.tile, sample.outlines)
-            sigma.append(np.where(known.density[inner] > 0, 0.0, found.sigma[inner])[seen])
-        worst = surface.worst_shown(np.concatenate(sigma), m.least_seen, m.max_sigma_m)
+            guessed.append(surface.Guesses(*(layer[inner][seen] for layer in guesses)))
+        law = surface.fit_growth(surface.Holdout(*(np.concatenate(column) for column in zip(*held, strict=True))))
+        own, distance, spread = (np.concatenate(column) for column in zip(*guessed, strict=True))
+        sigma = np.hypot(own, surface.growth_sigma(law, distance, spread))
+        worst = surface.worst_shown(sigma, m.least_seen, m.max_sigma_m)
         return Made({}, {**law._asdict(), "noise_scale": scale, "max_sigma_m": worst})
 
     inputs = [done.key for sample in samples for _, done in sample.neighbours]

@@ -121,6 +121,19 @@ def test_sigma_says_how_far_off_interpolation_is():
     assert np.mean(error[filled & (result.sigma > high)]) > 2 * np.mean(error[filled & (result.sigma < low)])
 
 
+def test_guesses_are_what_the_sigma_of_the_surface_comes_from():
+    z = rough(4, GRID)
+    cells = gridded(lines(np.random.default_rng(4), z, spacing=1.0, noise=0.002))
+    growth = Growth(0.08, 0.7, 0.3)
+    result = surface.delaunay_surface(GRID, cells, 0.4, growth)
+    own, distance, spread = surface.guesses(GRID, cells, 0.4)
+    sigma = np.hypot(own, surface.growth_sigma(growth, distance, spread))
+    empty = cells.density == 0
+    assert 0.1 < np.isnan(sigma[empty]).mean() < 0.9
+    np.testing.assert_array_equal(sigma[empty], result.sigma[empty])
+    assert not sigma[~empty].any()
+
+
 def test_growth_is_found_again():
     rng = np.random.default_rng(5)
     truth = Growth(0.08, 0.7, 0.3)
