@@ -1,7 +1,7 @@
-"""What a whole mission costs: `python benchmarks/mission.py [--images 500] [--width 3648] [--folder FOLDER]`.
+"""What a whole mission costs: `python benchmarks/mission.py [--images 500] [--width 3648] [--dense] [--folder FOLDER]`.
 
 Simulates `full` (or as many images of it as asked for, on lines of the same shape), processes it on a local cluster
-without dense matching, and prints a line of JSON: core seconds an image, all products included, and their ratio to
+without dense matching unless asked for, and prints a line of JSON: core seconds an image, all products included, and their ratio to
 decoding the same JPEG files in the same run; peak resident memory of all processes; then a rerun with nothing
 changed, and one with another `grid.cell_m`.
 
@@ -126,10 +126,10 @@ def simulated(folder: Path, images: int, width: int) -> Path:
     return mission
 
 
-def measure(folder: Path, images: int, width: int, workers: int) -> dict[str, Any]:
+def measure(folder: Path, images: int, width: int, workers: int, dense: bool) -> dict[str, Any]:
     mission, out = simulated(folder, images, width), folder / "out"
     shutil.rmtree(out, ignore_errors=True)
-    quick: dict[str, Any] = {"bathymetry": {"dense": False}}
+    quick: dict[str, Any] = {"bathymetry": {"dense": dense}}
     decoding = decode_seconds(mission)
     made, first = measured(mission, out, Parameters.model_validate(quick), workers)
     again, rerun = measured(mission, out, Parameters.model_validate(quick), workers)
@@ -140,6 +140,7 @@ def measure(folder: Path, images: int, width: int, workers: int) -> dict[str, An
         "images": images,
         "width_px": width,
         "workers": workers,
+        "dense": dense,
         "core_s_per_image": round(each, 3),
         "decoding_s_per_image": round(decoding, 4),
         "times_decoding": round(each / decoding, 2),
@@ -159,7 +160,8 @@ if __name__ == "__main__":
     parser.add_argument("--images", type=int, default=500)
     parser.add_argument("--width", type=int, default=SCENES["full"].width)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--dense", action="store_true", help="with dense matching")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "seamosaic-benchmark")
     arguments = parser.parse_args()
     dask.config.set({"distributed.worker.preload": [str(Path(__file__).resolve())]})
-    print(json.dumps(measure(arguments.folder, arguments.images, arguments.width, arguments.workers)))
+    print(json.dumps(measure(arguments.folder, arguments.images, arguments.width, arguments.workers, arguments.dense)))
