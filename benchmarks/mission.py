@@ -1,9 +1,9 @@
 """What a whole mission costs: `python benchmarks/mission.py [--images 500] [--width 3648] [--dense] [--folder FOLDER]`.
 
-Simulates `full` (or as many images of it as asked for, on lines of the same shape), processes it on a local cluster
-without dense matching unless asked for, and prints a line of JSON: core seconds an image, all products included, and their ratio to
-decoding the same JPEG files in the same run; peak resident memory of all processes; then a rerun with nothing
-changed, and one with another `grid.cell_m`.
+Simulates `full` (or as many images of it as asked for, on lines of the same shape), processes it on a local cluster,
+without dense matching unless asked for, and prints a line of JSON: core seconds an image, all products included, and
+their ratio to decoding the same JPEG files in the same run; peak resident memory of all processes; then a rerun with
+nothing changed, and one with another `grid.cell_m`.
 
 The simulated images are hard links to a few files, and seamosaic would extract each file once. Here every image
 counts as one of its own (`each_image_anew`), as those of a real mission are. Workers load this file: what they do not
