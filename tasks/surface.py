@@ -232,12 +232,12 @@ def delaunay_surface(
 
 
 class Guesses(NamedTuple):
-    """What the sigma of interpolated cells comes from, (height, width) each: 0 where sounded, NaN where none reaches.
+    """What the sigma of cells comes from, (height, width) each; NaN where nothing reaches.
 
     Attributes
     ----------
-    own_m : sigma of the corners.
-    distance_m, spread_m : what `growth_sigma` wants.
+    own_m : sigma of the corners; of sounded cells their own.
+    distance_m, spread_m : what `growth_sigma` wants; 0 where sounded.
     """
 
     own_m: Array
@@ -250,7 +250,7 @@ def guesses(grid: Grid, cells: Cells, max_distance_m: float, counted: Grid | Non
     empty = cells.density == 0
     reach = _reach(grid, cells, empty & _inside(grid, counted), max_distance_m)
     _, own, spread = _interpolated(cells, reach)
-    found = Guesses(*(np.where(empty, np.nan, 0.0) for _ in Guesses._fields))
+    found = Guesses(*(np.where(empty, np.nan, at) for at in (cells.sigma, 0.0, 0.0)))
     for layer, values in zip(found, (own, reach.distance, spread), strict=True):
         layer.ravel()[reach.cell] = values
     return found
@@ -273,15 +273,15 @@ def seen(grid: Grid, outlines: Array) -> Mask:
 
 
 def worst_shown(sigma: Array, least_share: float, max_sigma_m: float) -> float:
-    """The sigma up to which interpolated cells are worth showing, m.
+    """The sigma up to which interpolated cells are worth showing, m: that of which so many cells are no worse.
 
     Parameters
     ----------
-    sigma : (N,) of all cells that were seen; 0 where they were sounded, NaN where nothing reaches.
-    least_share : of them that are to have a value.
+    sigma : (N,) of all cells that were seen, sounded ones too; NaN where nothing reaches.
+    least_share : of them; 1 for all that max_sigma_m lets pass.
     max_sigma_m : more is never shown.
     """
-    if not len(sigma):
+    if not len(sigma) or least_share >= 1:
         return max_sigma_m
     worst = np.quantile(np.where(np.isfinite(sigma), sigma, np.inf), least_share, method="higher")
     return float(min(worst, max_sigma_m))

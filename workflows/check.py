@@ -156,7 +156,8 @@ def _cells(seen: Coverage | None, parameters: Parameters) -> list[tuple[str, str
     chosen = {"bathymetry": parameters.grid.cell_m, "mosaic": parameters.mosaic.cell_m}
     if seen is None:
         unknown = {
-            name: "set by the measured range" if cell == "auto" else f"{cell:g} m" for name, cell in chosen.items()
+            name: "set by the range that laser or matches tell" if cell == "auto" else f"{cell:g} m"
+            for name, cell in chosen.items()
         }
         return [(f"{name} cell", text) for name, text in unknown.items()]
     automatic = {"bathymetry": bathymetry_cell_m, "mosaic": mosaic_cell_m}

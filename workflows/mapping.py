@@ -1,15 +1,16 @@
 """From poses to maps: which images and pairs touch which tile, and the graphs over the tiles."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from dask.delayed import Delayed, delayed
 
 from ..tasks import camera as cameras
-from ..tasks import grids, pairs
+from ..tasks import grids, pairs, tiepoints
 from ..tasks.grids import Grid
-from . import dense, layers, maps, meshing, mosaics
-from .job import Done
+from . import dense, layers, maps, match, meshing, mosaics
+from .job import Done, load
 from .maps_inputs import Image, MapJob, Pair, Tile
 from .plan import batches
 from .results import Mapped, Posed, TerrainLayers, Tiles
@@ -24,6 +25,8 @@ _WORST_SIGMA = 1 / 75  # of the range: what interpolation knows less of it does 
 _LEAST_SEEN = 0.91  # of the ground that images see: where that is mapped, what is less certain stays empty
 _TIES_A_BATCH, _PAIRS_A_BATCH = 64, 16
 _AGREEMENT_PAIRS = 60
+_HEIGHT_PAIRS = 200
+_LEAST_TEXELS, _GROUND_CELLS = 256, 1024  # of a mosaic tile, and of the bathymetry below it
 
 
 class NothingToMap(RuntimeError):
@@ -33,10 +36,10 @@ class NothingToMap(RuntimeError):
 def map_tiles(state: Session, posed: Posed) -> Mapped:
     """Tiles: cells, surface, mosaics."""
     job, p = state.job, state.job.parameters
-    ranges = heights(state, posed.extracted)
+    ranges = heights(state, posed.extracted, posed.matched, posed.solution)
     images = _images(state, posed, ranges)
     if not images:
-        raise NothingToMap("no image has a pose: that takes navigation, or images that overlap and have a laser")
+        raise NothingToMap(_no_images([done.info["status"] for done in posed.extracted.values()]))
     typical = float(np.median(ranges[[image.row for image in images]]))
     gsd = cameras.ground_sample_distance(job.calibration.camera, typical)
     cell = grids.bathymetry_cell_m(gsd) if p.grid.cell_m == "auto" else float(p.grid.cell_m)
@@ -81,6 +84,14 @@ def _images(state: Session, posed: Posed, ranges: np.ndarray) -> list[Image]:
         for image in state.plan.images
         if known[image.row] and not posed.extracted[image.row].info["status"]
     ]
+
+
+def _no_images(status: Sequence[str]) -> str:
+    rejected = Counter(one for one in status if one)
+    if len(status) > rejected.total():
+        return "no image has a pose: that takes navigation, or images that overlap and have a laser"
+    reason, count = rejected.most_common(1)[0] if rejected else ("no image is left", 0)
+    return f"no image of {len(status):,} can be used; {count:,} of them: {reason}"
 
 
 def _outlines(state: Session, solution: Solution, ranges: np.ndarray) -> np.ndarray:
@@ -354,7 +365,9 @@ def _mosaics(
         state, mosaics.ALIGN, [delayed(mosaics.align_planar)(m, shown, linked, dask_key_name=state.key("align"))]
     )
     footprints, placed = _Footprints(outlines, shown, aligned.info["moved_m"]), _Placed(ground.tiles)
-    tiles = grids.tiles(grid, state.job.parameters.mosaic.tile_cells)
+    # no more ground below a tile than usual, however coarse the mosaic
+    size = min(state.job.parameters.mosaic.tile_cells, max(_LEAST_TEXELS, int(_GROUND_CELLS * m.cell_m / cell)))
+    tiles = grids.tiles(grid, size)
     seen = [Tile(tile, touching) for tile in tiles if (touching := footprints.touching(tile))]
     key_alone, tasks = aligned._replace(info={}), []  # its info is of all images
     for k, tile in enumerate(seen):
@@ -404,14 +417,32 @@ def _mesh(
     return dict(zip(tasks, made, strict=True))
 
 
-def heights(state: Session, extracted: Mapping[int, Done]) -> np.ndarray:
+def heights(
+    state: Session, extracted: Mapping[int, Done], matched: Sequence[tuple[int, int, Done]], solution: Solution
+) -> np.ndarray:
     """Heights (n,) of all cameras above the seabed by their lasers, metres, or by the altimeter; where there is no
-    altimeter, by the lasers of the images before and after."""
+    altimeter, by the lasers of the images before and after, and where there is no laser either, by the matches."""
     count, altitude = len(state.plan.range_m), state.opened.frames["altitude"].values
     told = np.full(count, np.nan)
     for row, done in extracted.items():
         told[row] = done.info.get("range_m") or np.nan
-    lit = np.flatnonzero(np.isfinite(told))
-    by_others = len(lit) and not np.isfinite(altitude).any()
-    otherwise = np.interp(np.arange(count), lit, told[lit]) if by_others else state.plan.range_m
+    otherwise = state.plan.range_m
+    if not np.isfinite(altitude).any():
+        if not np.isfinite(told).any():
+            told = _heights_by_matches(state, matched, solution)
+        lit = np.flatnonzero(np.isfinite(told))
+        otherwise = np.interp(np.arange(count), lit, told[lit]) if len(lit) else otherwise
     return np.where(np.isfinite(told), told, otherwise)
+
+
+def _heights_by_matches(state: Session, matched: Sequence[tuple[int, int, Done]], solution: Solution) -> np.ndarray:
+    """Heights (n,) of cameras over the triangulated matches of some of them; NaN for the others."""
+    poses, found = solution.poses, np.full(len(solution.poses.known), np.nan)
+    linked = [(i, j, done) for i, j, done in matched if done.info["model"] and poses.known[[i, j]].all()]
+    for i, j, done in linked[:: -(-len(linked) // _HEIGHT_PAIRS) or 1]:
+        arrays = load(state.job, match.STEP, done.key, ("uv_i", "uv_j")).arrays
+        uv_i, uv_j = (arrays[name].astype(float) for name in ("uv_i", "uv_j"))
+        X = tiepoints.triangulate(state.job.calibration.camera, uv_i, uv_j, poses, i, j).X_local
+        for row in (i, j) if len(X) else ():
+            found[row] = np.median((X - poses.C_local[row]) @ poses.R_local_camera[row, :, 2])
+    return found

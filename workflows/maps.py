@@ -1,7 +1,7 @@
 """Per map tile: soundings to cells, cells to surface. What touches a tile decides its digest."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,8 @@ _LEAST_HALO = 6  # cells
 # have in common, as they share images and the bend of the whole, so that it does not average down
 _SHARED, _BEND = 0.5, 0.5
 _LEAST_NOISE_PX = 0.02
+_ONE_LINE = 0.05  # of points' extent: less aside tells no slope across
+_FINE_CELLS = 1536  # across, of the usual cells that coarse ones are made of at a time
 _BESIDE = "beside_"  # names of what matching says of the laser's cells
 _TRUST = 2 / 3  # in what laser and matching say of each other, against what the adjustment says
 
@@ -111,9 +113,17 @@ def _laser(m: MapJob, image: Image, solution: Solution) -> Soundings:
     X_camera = arrays.get("laser_X", np.zeros((0, 3)))
     aside = X_camera @ solution.poses.R_local_camera[image.row].T
     lean = np.hypot(aside[:, 0], aside[:, 1]) * solution.sigma_tilt_rad[image.row]
-    shared = np.hypot(solution.sigma_m[image.row, 2], lean)
+    # an image that lies beside its place has a slope too high or too low
+    moved = np.linalg.norm(_slope(aside) * solution.sigma_m[image.row, :2])
+    shared = np.hypot(np.hypot(solution.sigma_m[image.row, 2], moved), lean)
     X = m.frame.map_around(dense.sounded(m, image, solution), solution.poses.C_local[image.row])
     return _soundings(X, arrays.get("laser_sigma", np.zeros(0)), LASER, image.row, shared)
+
+
+def _slope(X: np.ndarray) -> np.ndarray:
+    """Rise over run (2,) of the plane through points (N, 3); level across a single line and where there are none."""
+    off = X - X.mean(0) if len(X) else X
+    return np.linalg.lstsq(off[:, :2], off[:, 2], rcond=_ONE_LINE)[0]
 
 
 def _matched(m: MapJob, pair: Pair, solution: Solution, tie_px: float) -> Soundings:
@@ -145,8 +155,8 @@ def fit_growth(m: MapJob, samples: Sequence[Sample]) -> Done:
     Matching, noise_scale of the info, where the laser has seen the same cells; interpolation by soundings held out;
     both in some of the tiles.
 
-    Interpolated cells are shown as long as they are more certain than max_sigma_m of the info: no more of them than it
-    takes to map `m.least_seen` of the ground that images have seen, and none less certain than m.max_sigma_m.
+    Interpolated cells are shown as long as they are more certain than max_sigma_m of the info: than the worst of the
+    best `m.least_seen` of the cells that images have seen, and than m.max_sigma_m.
     """
 
     def make() -> Made:
@@ -221,17 +231,25 @@ def coarse_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]]) 
     inputs, usual = [done.key for _, done in neighbours], neighbours[0][0].cell_m
     worst = neighbours[0][1].info["max_sigma_m"]
 
-    def make() -> Made:
+    def part(tile: Grid) -> coarsening.Coarse:
         around = grids.pad(grids.grid_around(tile.bounds, usual), 1)
         values = {name: np.full(around.shape, np.nan) for name in ("elevation", "sigma")}
         values |= {name: np.zeros(around.shape, np.int64) for name in ("source", "density")}
         for grid, done in neighbours:
-            arrays = load(m.job, SURFACE, done.key, values).arrays
-            for name, whole in values.items():
-                paste(around, whole, grid, arrays[name])
-        found = coarsening.coarsen(around, **values, coarse=tile)._asdict()
-        layers = {name: a.astype(np.float32) if a.dtype == float else a for name, a in found.items()}
-        return Made(layers, {"cells": int(np.isfinite(found["elevation"]).sum()), "max_sigma_m": worst})
+            if grids.intersection(around, grid) is not None:
+                arrays = load(m.job, SURFACE, done.key, values).arrays
+                for name, whole in values.items():
+                    paste(around, whole, grid, arrays[name])
+        return coarsening.coarsen(around, **values, coarse=tile)
+
+    def make() -> Made:
+        layers: dict[str, np.ndarray] = {}
+        for block in _blocks(tile, _FINE_CELLS * usual / tile.cell_m):
+            for name, values in part(block)._asdict().items():
+                values = values.astype(np.float32) if values.dtype == float else values
+                layers.setdefault(name, np.zeros(tile.shape, values.dtype))
+                paste(tile, layers[name], block, values)
+        return Made(layers, {"cells": int(np.isfinite(layers["elevation"]).sum()), "max_sigma_m": worst})
 
     return once(m.job, SURFACE, _VERSION, inputs, [list(tile), worst], make, compress=True)
 
@@ -242,6 +260,17 @@ def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]], noise_scale
 
 def _window_m(tiles: Sequence[tuple[Grid, Done]]) -> float:
     return max((done.info["window_m"] for _, done in tiles), default=0.0)
+
+
+def _blocks(tile: Grid, most: float) -> Iterator[Grid]:
+    """A tile halved until no part has more cells across."""
+    size = max(tile.shape)
+    while size > max(most, 1):
+        size = -(-size // 2)
+    for row in range(0, tile.height, size):
+        for column in range(0, tile.width, size):
+            rows, columns = min(size, tile.height - row), min(size, tile.width - column)
+            yield Grid(tile.cell_m, tile.left + column, tile.top - row, columns, rows)
 
 
 def _gridded(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]], prefix: str = "") -> Cells:

@@ -172,18 +172,21 @@ def misplaced_pairs(
 ) -> list[Wanted]:
     """With navigation: pairs not linked that overlap by the adjusted poses, but for navigation lie elsewhere.
 
-    Where navigation jumped or drifted more than it says, its pairs are the wrong ones.
+    Where navigation jumped or drifted more than it says, its pairs are the wrong ones; so are some where no altimeter
+    says how wide images are.
     """
     assert made.prior is not None
     corrected, lit, linked = adjusted_prior(made, poses), _lit(made), set(known)
     assert corrected is not None
     moved = poses.C_local - made.prior.poses.C_local
-    found = []
+    found, guessed = [], not np.isfinite(opened.frames["altitude"].values).any()
     for i, j in _overlapping(made, opened, parameters, poses, range_m, _margin(made.prior)):
         off, above = float(np.linalg.norm(moved[j] - moved[i])), float(range_m[i])
-        if (i, j) in linked or not off > NEAR_SHARE * above:
+        if (i, j) in linked or not (guessed or off > NEAR_SHARE * above):
             continue
-        if off > margin_m(navigation.relative(corrected, i, j), above):
+        if guessed:
+            found.append(Wanted(i, j, above, lit.get(i, ()), lit.get(j, ())))
+        elif off > margin_m(navigation.relative(corrected, i, j), above):
             found.append(Wanted(i, j, above, lit.get(i, ()), lit.get(j, ()), free=True))
     return found
 

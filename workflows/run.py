@@ -274,7 +274,7 @@ def _close_loops(
     """
     job, made = state.job, state.plan
     extracted = _by_row(made, extracts)
-    ranges = mapping.heights(state, extracted)
+    ranges = mapping.heights(state, extracted, matched, _solution(job, adjustments[-1]))
     more = plan.chained_pairs if made.prior is None else plan.misplaced_pairs
     known = [(i, j) for i, j, done in matched if made.prior is None or done.info["model"]]
     for turn in range(_LOOP_ROUNDS if made.prior is None else 1):

@@ -131,7 +131,7 @@ def test_guesses_are_what_the_sigma_of_the_surface_comes_from():
     empty = cells.density == 0
     assert 0.1 < np.isnan(sigma[empty]).mean() < 0.9
     np.testing.assert_array_equal(sigma[empty], result.sigma[empty])
-    assert not sigma[~empty].any()
+    np.testing.assert_array_equal(sigma[~empty], cells.sigma[~empty])
 
 
 def test_growth_is_found_again():
@@ -194,6 +194,11 @@ def test_no_more_guesses_are_shown_than_it_takes():
     # where nothing reaches enough ground, all is shown that is certain enough
     assert surface.worst_shown(sigma, 0.99, 0.05) == 0.05
     assert surface.worst_shown(np.zeros(0), 0.9, 0.05) == 0.05
+    # nor less than is as certain as what was sounded: a pinhole is no guess
+    sounded = np.concatenate([np.linspace(0.001, 0.003, 970), [0.002] * 30])
+    assert 0.0027 < surface.worst_shown(sounded, 0.91, 0.05) < 0.0029
+    # what the user allows is shown
+    assert surface.worst_shown(sounded, 1.0, 0.05) == 0.05
 
 
 def test_ground_is_seen_where_an_outline_has_it():

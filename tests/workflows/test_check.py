@@ -68,13 +68,13 @@ def test_chosen_cells_are_kept(tiny_mission: Path) -> None:
 def test_without_navigation_or_altitude(tiny_mission: Path) -> None:
     edit(tiny_mission / "navigation.csv", ",3.1,", ",,")
     result = check(str(tiny_mission), DEFAULT)
-    assert dict(result.plan)["bathymetry cell"] == "set by the measured range"
+    assert dict(result.plan)["bathymetry cell"] == "set by the range that laser or matches tell"
     assert "warning: 10 of 10 images have no altitude" in printed(result)
     path = tiny_mission / "mission.yaml"
     path.write_text(path.read_text().split("navigation:")[0])
     plan = dict(check(str(tiny_mission), Parameters(grid=GridParameters(cell_m=0.5))).plan)
     assert plan["map"] == "local frame, origin at the first image placed"
-    assert (plan["bathymetry cell"], plan["mosaic cell"]) == ("0.5 m", "set by the measured range")
+    assert (plan["bathymetry cell"], plan["mosaic cell"]) == ("0.5 m", "set by the range that laser or matches tell")
 
 
 def test_some_altitudes_are_enough(tiny_mission: Path) -> None:

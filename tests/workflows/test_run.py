@@ -21,11 +21,13 @@ import xarray
 import yaml
 from rio_cogeo import cog_validate
 from seamosaic.catalog import memory, trajectories
+from seamosaic.workflows.calibrate_inputs import read_calibration
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.products import PRODUCTS
-from seamosaic.tasks import derivatives
-from seamosaic.workflows import mesh_products, products
+from seamosaic.tasks import derivatives, grids
+from seamosaic.tasks.camera import ground_sample_distance
+from seamosaic.workflows import maps, mesh_products, products
 from seamosaic.workflows.evaluate import evaluate
 from seamosaic.workflows.mapping import NothingToMap
 from seamosaic.workflows.run import run
@@ -158,6 +160,18 @@ def test_a_second_run_computes_nothing_and_makes_no_version(reef):
     again = run(str(reef.mission), reef.out, Parameters(), scheduler="sync")
     assert again.steps == ()  # it was not even looked at
     assert (again.path, again.new) == (reef.result.path, False)
+
+
+def test_coarse_cells_are_the_same_whatever_is_held_at_a_time(reef, tmp_path, monkeypatch):
+    parameters, found = Parameters.model_validate({"grid": {"cell_m": 0.3}}), []
+    for most in (maps._FINE_CELLS, 40):
+        out = tmp_path / str(most)
+        shutil.copytree(reef.out, out)
+        monkeypatch.setattr(maps, "_FINE_CELLS", most)
+        with rasterio.open(run(str(reef.mission), out, parameters, scheduler="sync").path / "bathymetry.tif") as raster:
+            found.append(raster.read())
+    assert np.isfinite(found[0][0]).sum() > 50
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
 
 
 def test_a_mission_is_never_written_to(reef):
@@ -374,6 +388,20 @@ def test_photographs_turned_by_a_viewer_are_placed_and_named(tmp_path):
     (warning,) = [text for text in quality.warnings if "other way round" in text]
     assert warning.startswith("1 of 4 images")
     assert turned[0].name in warning
+
+
+def test_matches_tell_the_height_where_neither_laser_nor_altimeter_does(tmp_path):
+    mission = small_mission(tmp_path / "mission", "reef", images=4, survey={"lines": 1, "altitude_m": 5.0})
+    _without_laser(mission)
+    head, *rows = [line.split(",") for line in (mission / "navigation.csv").read_text().split()]
+    for row in rows:
+        row[head.index("altitude")] = ""
+    (mission / "navigation.csv").write_text("".join(",".join(row) + "\n" for row in [head, *rows]))
+    made = run(str(mission), tmp_path / "out", Parameters(), scheduler="sync")
+    camera = read_calibration(mission / "calibration.yaml").camera
+    expected = grids.bathymetry_cell_m(ground_sample_distance(camera, 4.9))
+    with rasterio.open(made.path / "bathymetry.tif") as raster:
+        assert raster.res[0] == pytest.approx(expected, rel=0.15)
 
 
 def _without_laser(mission):
