@@ -336,9 +336,9 @@ def compose(plans: Sequence[Plan], read: Read, reductions: dict[int, int], gamma
     light = ((np.arange(256) / 255) ** gamma).astype(np.float32)
     sums = [np.zeros((*p.place.blocks.shape, 3), np.float32) for p in plans]
     for number, parts in _by_number(plans):
-        times = reductions[number]
-        image = read(number, times)
-        painted = None
+        times, shot = reductions[number], parts[0][1].shot
+        image = picture(shot, read, times)
+        painted = image if times > _finest(shot) else None
         for k, laid in parts:
             for patch in laid.patches:
                 if patch.painted and painted is None:
@@ -346,6 +346,21 @@ def compose(plans: Sequence[Plan], read: Read, reductions: dict[int, int], gamma
                 source = painted if patch.painted and painted is not None else image
                 _lay(sums[k], plans[k].place, laid, patch, source, times, light)
     return [_finish(p, total, gamma) for p, total in zip(plans, sums, strict=True)]
+
+
+def picture(shot: Shot, read: Read, times: int) -> Pixels:
+    """An image so many times smaller; without laser light where its pixels are larger than those it is known by."""
+    finest = min(times, _finest(shot))
+    image = read(shot.number, finest)
+    if finest == times:
+        return image
+    size = tuple(-(-side * finest // times) for side in image.shape[1::-1])
+    return np.asarray(cv2.resize(paint_over(image, shot.quality == ERASED), size, interpolation=cv2.INTER_AREA))
+
+
+def _finest(shot: Shot) -> int:
+    """How many times smaller an image may be read so that its pixels are lit by the laser or not, a power of two."""
+    return 2 ** int(math.log2(quality_scale(shot.camera)))
 
 
 def _by_number(plans: Sequence[Plan]) -> Iterator[tuple[int, list[tuple[int, Laid]]]]:

@@ -255,10 +255,10 @@ def _with_steep_faces(
         return made.nodes, made.z, made.triangles, uv, ortho
     model = mosaics.light_model(m.job, steep.light)
     lens = m.job.calibration.camera
-    views = []
+    views, shots = [], {image.row: mosaics.shot(m.job, image, None) for image in steep.images}
     for image in steep.images:
         R, C = steep.poses.R_local_camera[image.row], steep.poses.C_local[image.row]
-        views.append((mosaics.shot(m.job, image, None), nodes.lie(steep.relief.local, R, C)))
+        views.append((shots[image.row], nodes.lie(steep.relief.local, R, C)))
     times = {row: mosaic.reduction(lens, image.range_m, steep.mosaic_cell_m) for row, image in images.items()}
     own = mesh.leaf_grid(place.column, place.row, m.cell_m)
     found = steep_faces.charts(X_map, made.triangles, steep.relief, own, views, times, steep.mosaic_cell_m)
@@ -269,7 +269,9 @@ def _with_steep_faces(
     gamma, tone = m.job.parameters.mosaic.gamma, mosaics.tone(lens, model) if model else None
     sheet = np.zeros((steep_faces.sheet_rows(placed), size, 3), np.uint8)
     for row in sorted({found[k].number for k in placed}):
-        picture = mosaics.read_image(m.job, images[row], times[row])
+        picture = mosaic.picture(
+            shots[row], lambda row, reduce: mosaics.read_image(m.job, images[row], reduce), times[row]
+        )
         for k, at in placed.items():
             if found[k].number != row:
                 continue

@@ -184,6 +184,17 @@ def test_coarse_cells_average_pixels():
     assert abs(result.rgb.mean() - 127) < 3
 
 
+def test_no_laser_is_mixed_into_coarse_cells():
+    coarse, (left, _) = Grid(0.05, -10, 9, 20, 18), two_views()
+    assert mosaic.reduction(CAMERA, 3.0, 0.05) > nodes.quality_scale(CAMERA)
+    clean = compose(coarse, terrain_of(flat, coarse), [left])
+    left.image[:, 162:174] = 0, 255, 0
+    left.erase[:, 161:175] = True
+    found = compose(coarse, terrain_of(flat, coarse), [left])
+    off = np.abs(found.rgb.astype(int) - clean.rgb)[:, found.mask]
+    assert 0 < off.max() < 60
+
+
 def test_holes_in_the_surface_and_images_elsewhere_leave_nothing():
     view = photograph(*pose(0.0, 0.0, 0.0), flat, 0)
     terrain = terrain_of(flat)

@@ -21,13 +21,13 @@ import xarray
 import yaml
 from rio_cogeo import cog_validate
 from seamosaic.catalog import memory, trajectories
-from seamosaic.workflows.calibrate_inputs import read_calibration
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.products import PRODUCTS
 from seamosaic.tasks import derivatives, grids
 from seamosaic.tasks.camera import ground_sample_distance
 from seamosaic.workflows import maps, mesh_products, products
+from seamosaic.workflows.calibrate_inputs import read_calibration
 from seamosaic.workflows.evaluate import evaluate
 from seamosaic.workflows.mapping import NothingToMap
 from seamosaic.workflows.run import run
