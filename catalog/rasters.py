@@ -223,13 +223,14 @@ class RasterWriter:
         common = {
             "BLOCKSIZE": str(_BLOCK),
             "BIGTIFF": "IF_SAFER",
+            "SPARSE_OK": "YES",  # what a survey leaves empty of its rectangle costs nothing
             "OVERVIEW_RESAMPLING": self.layer.resampling,
             "NUM_THREADS": "ALL_CPUS",
         }
         if self.layer.mask:
             return common | {"COMPRESS": "JPEG", "QUALITY": str(_JPEG_QUALITY), "OVERVIEW_QUALITY": str(_JPEG_QUALITY)}
         quantity = "YES" if self.layer.resampling == "average" else "NO"  # codes and numbers have no mean
-        return common | {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "SPARSE_OK": "YES", "STATISTICS": quantity}
+        return common | {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "STATISTICS": quantity}
 
 
 def gdal_settings() -> rasterio.Env:
