@@ -14,6 +14,7 @@ from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput, Problem
 from ..schemas.yaml_input import load_model, load_parameters
 from .filesystems import ObjectStoreError, absolute, asking, connect, entries, is_glob
+from .mission_files import no_access
 from .mission_inputs import MISSION
 
 ARCHIVE: Final = "archive.yaml"
@@ -47,6 +48,8 @@ def is_archive(url: str) -> bool:
     ------
     ObjectStoreError
         If the store does not answer.
+    InvalidInput
+        If it may not be looked at.
     """
     try:
         filesystem, path = connect(url)
@@ -54,6 +57,8 @@ def is_archive(url: str) -> bool:
             return filesystem.info(f"{path.rstrip('/')}/{ARCHIVE}")["type"] == "file"
     except ObjectStoreError:
         raise
+    except PermissionError as error:
+        raise InvalidInput([no_access(url, error, "a mission or an archive that can be read")]) from error
     except (OSError, ValueError, ImportError):  # said better where it is opened
         return False
 

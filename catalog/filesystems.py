@@ -159,6 +159,14 @@ def write_whole(url: str, data: bytes, scratch: str) -> None:
             os.remove(temporary)
 
 
+def _another_was_first(error: OSError) -> bool:
+    """Whether a store says that an object is there already, or that two came at once: not all in s3fs's words."""
+    answer: Any = getattr(error.__cause__, "response", None) or {}
+    code = str(answer.get("Error", {}).get("Code", ""))
+    conflicts = "ConditionalRequestConflict", "PreconditionFailed"
+    return code in (*conflicts, "412") or any(name in str(error) for name in conflicts)
+
+
 def create(fs: AbstractFileSystem, path: str, data: bytes) -> bool:
     """Write a file unless it is there; whether it is now the one that we wrote.
 
@@ -173,7 +181,7 @@ def create(fs: AbstractFileSystem, path: str, data: bytes) -> bool:
         except FileExistsError:
             pass
         except OSError as error:
-            if "ConditionalRequestConflict" not in str(error):  # two at the same moment, neither of them first
+            if not _another_was_first(error):
                 raise
         try:
             return fs.cat_file(path) == data

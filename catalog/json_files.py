@@ -16,8 +16,10 @@ from .filesystems import ObjectStoreError, asking, connect, create, settle
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 
 
-def read_json(url: str) -> Any | None:
-    """What the file holds; None if there is none or it is damaged.
+def read_json(url: str, *, sure: bool = False) -> Any | None:
+    """What the file holds; None if there is none or it is damaged, or may not or cannot be read.
+
+    sure : raise what keeps it from being read, as it may be there.
 
     Raises
     ------
@@ -28,9 +30,11 @@ def read_json(url: str) -> Any | None:
     try:
         with asking(filesystem, url):
             return json.loads(filesystem.cat_file(path))  # type: ignore[arg-type]
-    except ObjectStoreError:
-        raise
-    except (OSError, ValueError):
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return None
+    except OSError as error:
+        if sure or isinstance(error, ObjectStoreError):
+            raise
         return None
 
 
@@ -47,7 +51,8 @@ def write_json(url: str, value: Any, new: bool = False) -> None:
         If it has to be new and is not.
     """
     filesystem, path = connect(url)
-    data = (json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
+    text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    data = text.encode("utf-8", "backslashreplace")  # names that are no UTF-8 have escapes, in JSON too
     if isinstance(filesystem, LocalFileSystem):
         _write_local(path, data, new)
     elif not new:  # an object is put whole

@@ -105,7 +105,8 @@ class Lease:
                     self.lost.set()
                     return
                 json_files.write_json(self.url, self.holder._replace(heartbeat=time.time())._asdict())
-                renewed = time.monotonic()
+                if time.monotonic() - renewed < term:  # else another may have begun before it was written
+                    renewed = time.monotonic()
 
     def is_ours(self) -> bool:
         """Whether it has not been taken by another."""
@@ -201,7 +202,7 @@ def _all(folder: str) -> list[tuple[int, Holder | None]]:
 
 
 def _read(url: str) -> Holder | None:
-    found: Any = json_files.read_json(url)
+    found: Any = json_files.read_json(url, sure=True)
     try:
         return Holder(**found)
     except TypeError:

@@ -28,7 +28,8 @@ class Look(NamedTuple):
     ----------
     id, title, platform : of mission.yaml. start, end : first and last exposure, ISO 8601, UTC; empty if unknown.
     images : how many. unread : how many of them are new or were changed since they were last read whole.
-    texts : SHA-256 of the text files, by name. inputs : digest of all that a run reads; None with unread images.
+    texts : SHA-256 of the text files, by name. inputs : digest of all that a run reads, of unread images that they
+        could not be read; None if there are no others.
     """
 
     id: str
@@ -75,7 +76,9 @@ def look(url: str, out: str) -> Look:
     """
     memory, keys = recall(url, out), _keys(url)
     same = memory.state is not None and memory.state == _state(keys)
-    if memory.look is not None and same and _texts_same(url, memory.look.texts):
+    # images that could not be read when others were may be readable now, and look the same from outside
+    whole = memory.look is not None and not (memory.look.inputs and memory.look.unread)
+    if memory.look is not None and whole and same and _texts_same(url, memory.look.texts):
         return memory.look
     opened = open_mission(url, dict(memory.images), hashed=None)
     if recall(url, out) != memory:  # a run has read the images meanwhile
@@ -92,7 +95,8 @@ class Memory(NamedTuple):
 
 
 def _place(url: str, out: str) -> str:
-    return f"{out.rstrip('/')}/{FOLDER}/{hashlib.sha256(absolute(url).encode()).hexdigest()[:24]}.json"
+    name = hashlib.sha256(absolute(url).encode("utf-8", "surrogateescape")).hexdigest()[:24]
+    return f"{out.rstrip('/')}/{FOLDER}/{name}.json"
 
 
 def recall(url: str, out: str) -> Memory:

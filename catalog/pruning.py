@@ -43,6 +43,13 @@ class Pruned(NamedTuple):
     failed: tuple[str, ...] = ()
 
 
+def there(out: str) -> bool:
+    """Whether there is such a folder."""
+    filesystem, path = connect(out)
+    with asking(filesystem, out):
+        return filesystem.isdir(path)
+
+
 def prune(out: str, keep_bytes: float, *, dry_run: bool = False, term_s: float = leases.TERM_S) -> Pruned:
     """Remove intermediate results until what is left of them in OUT is no more than keep_bytes.
 

@@ -355,7 +355,8 @@ def picture(shot: Shot, read: Read, times: int) -> Pixels:
     if finest == times:
         return image
     size = tuple(-(-side * finest // times) for side in image.shape[1::-1])
-    return np.asarray(cv2.resize(paint_over(image, shot.quality == ERASED), size, interpolation=cv2.INTER_AREA))
+    small = cv2.resize(paint_over(image, shot.quality == ERASED), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
 
 
 def _finest(shot: Shot) -> int:

@@ -248,6 +248,8 @@ def _begin(archive: OpenedArchive, state: MissionState, options: Options) -> _Ch
         except OSError as error:
             return _failed(state, f"no lease could be taken: {error}")
         now = archive_states.assess(archive, state.url, ours=True)
+        if now.id and now.id != state.id:  # under another lease; and its twins were not looked for
+            return _failed(state, f"its id has become {now.id} meanwhile; the next run takes it")
         if now.state not in TO_DO:
             return _settled(archive, now)
         child = _Child(archive, now, options, lease)
@@ -284,4 +286,6 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
-        signal.raise_signal(signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(_PATIENCE_S)  # for what is being written: until then another run may have begun
+        os._exit(1)

@@ -11,6 +11,7 @@ from ..schemas.parameters import Parameters
 from ..schemas.problems import InvalidInput
 from ..schemas.provenance import Request
 from . import request
+from .job import log
 from .run import CODE
 
 NEW, STALE, CURRENT, RUNNING = "new", "stale", "current", "running"
@@ -78,8 +79,9 @@ def assess(archive: OpenedArchive, url: str, ours: bool = False) -> MissionState
         look = memory.look(url, archive.products)
     except InvalidInput as error:
         return _invalid(url, "", None, error)
-    except OSError as error:  # an object store that does not answer for this one
-        return MissionState(url, "", None, INVALID, f"it cannot be read: {error}", "nothing")
+    except Exception as error:  # an object store that does not answer for this one; the others are not to suffer
+        log.debug("mission=%s step=%s failed", url, "look", exc_info=True)
+        return MissionState(url, "", None, INVALID, f"it cannot be read: {error or type(error).__name__}", "nothing")
     try:
         return _assess(archive, url, look, ours)
     except OSError as error:  # its versions may not be read; the other missions are not to suffer

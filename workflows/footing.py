@@ -61,6 +61,9 @@ def software() -> tuple[tuple[str, str], ...]:
     return ("seamosaic", sha.hexdigest()[:12]), ("python", python), *libraries
 
 
+software()  # of the files as they were when this process loaded them
+
+
 def why_not(mission_url: str, store: Store, footing: Footing) -> str:
     """Why this process cannot work on a mission; empty if it can."""
     ours = dict(software())

@@ -5,7 +5,8 @@ import inspect
 import logging
 import sys
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -61,13 +62,15 @@ class Made(NamedTuple):
     info: Mapping[str, Any]
 
 
-def code_version(*modules: ModuleType) -> str:
+def code_version(*modules: ModuleType, pages: Iterable[Path] = ()) -> str:
     """Digest of the code behind a step: these modules, all of `tasks` and `catalog.images` that they use, the
-    calibration's model, and the versions of the libraries that compute. A change makes the step's results stale."""
+    calibration's model, templates of pages, and the versions of the libraries that compute. A change makes the step's
+    results stale."""
     seen: dict[str, ModuleType] = {}
     for module in modules:
         _follow(module, seen)
     text = "".join(inspect.getsource(seen[name]) for name in sorted(seen))
+    text += "".join(page.read_text("utf-8") for page in pages)
     libraries = ",".join(f"{name}={number}" for name, number in installed(*COMPUTING))
     return hashlib.sha256((text + libraries).encode()).hexdigest()[:16]
 

@@ -47,7 +47,7 @@ DECIDING = (
     *(sys.modules[__name__], report_figures, meshes, metadata, netcdf, pointclouds, rasters, trajectories, vectors),
     *(contours, mesh_products, tiles3d, report, quality, calibration_quality, residual_quality, unchanged),
 )
-VERSION = code_version(*DECIDING)
+VERSION = code_version(*DECIDING, pages=[report.TEMPLATE])
 _WRITERS = 2  # each holds a tile
 _STAC_LICENCE = re.compile(r"[\w.+-]+")  # an SPDX identifier; other texts STAC has no field for
 

@@ -24,7 +24,7 @@ from .quality import ring_text
 
 _REJECTED_SHOWN: Final = 200
 _WORST_SHOWN: Final = 10
-_TEMPLATE: Final = "report.html"
+TEMPLATE: Final = Path(__file__).with_name("templates") / "report.html"
 _WRITTEN_LATER: Final = ("report.html", "metadata/provenance.json")
 
 
@@ -84,7 +84,7 @@ def write_report(
     root = Path(folder)
     rows = trajectories.read(root / "trajectory.csv")
     rejected = [row for row in rows if row.kind == "rejected"]
-    page = template(_TEMPLATE).render(
+    page = template(TEMPLATE.name).render(
         quality=quality,
         title=quality.mission.title or quality.mission.id,
         key_figures=list(_key_figures(quality)),

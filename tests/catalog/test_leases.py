@@ -1,5 +1,6 @@
 """Leases: one holder at a time, renewed while it lives, free when it died, nothing left behind."""
 
+import errno
 import itertools
 import os
 import signal
@@ -130,6 +131,31 @@ def test_who_could_not_renew_it_has_lost_it_and_says_so(tmp_path, monkeypatch):
         monkeypatch.setattr(json_files, "write_json", full)
         assert lease.lost.wait(20)
         assert "could not be renewed for 1 s" in lease.why
+
+
+def test_who_renewed_it_too_late_has_lost_it(tmp_path, monkeypatch):
+    write = json_files.write_json
+
+    def slow(*given, **more):
+        time.sleep(1.5)
+        write(*given, **more)
+
+    with leases.take(str(tmp_path), "reef", term_s=1) as lease:
+        monkeypatch.setattr(json_files, "write_json", slow)
+        assert lease.lost.wait(20)
+        assert "could not be renewed for 1 s" in lease.why
+
+
+def test_what_cannot_be_read_for_a_moment_is_not_lost(tmp_path, monkeypatch):
+    with leases.take(str(tmp_path), "reef", term_s=4) as lease:
+        with monkeypatch.context() as patch:
+            patch.setattr(leases.json_files, "connect", _down)
+            assert not lease.lost.wait(2)
+        assert not lease.lost.wait(4)
+
+
+def _down(url):
+    raise OSError(errno.EIO, "input/output error")
 
 
 def test_runs_of_one_mission_share_and_are_not_pruned(tmp_path):

@@ -55,6 +55,30 @@ def test_an_image_that_was_changed_is_unread_until_it_is_read(tiny_mission, tmp_
     assert memory.inputs_digest(memory.open_known(url, out)) == before
 
 
+def test_an_image_that_could_not_be_read_is_asked_for_again(tiny_mission, tmp_path, read, monkeypatch):
+    url, out, inspect = str(tiny_mission), str(tmp_path / "out"), digests._inspect
+    refused = sorted((tiny_mission / "images").iterdir())[3].name
+
+    def refusing(fs, path):
+        return digests._unreadable(OSError("timed out")) if path.endswith(refused) else inspect(fs, path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(digests, "_inspect", refusing)
+        before = memory.inputs_digest(memory.open_known(url, out))
+    found = memory.look(url, out)
+    assert (found.unread, found.inputs) == (1, None)  # nothing about the files has changed
+    assert memory.inputs_digest(memory.open_known(url, out)) != before
+    assert memory.look(url, out).unread == 0
+
+
+def test_a_folder_of_any_name_is_remembered(tiny_mission, tmp_path, read):
+    odd = tmp_path / os.fsdecode(b"M\xe9diterran\xe9e")
+    tiny_mission.rename(odd)
+    memory.open_known(str(odd), str(tmp_path / "out"))
+    assert memory.look(str(odd), str(tmp_path / "out")).unread == 0
+    assert len(read) == 10
+
+
 def test_a_removed_image_is_known_to_be_gone(tiny_mission, tmp_path, read):
     url, out = str(tiny_mission), str(tmp_path / "out")
     before = memory.inputs_digest(memory.open_known(url, out))

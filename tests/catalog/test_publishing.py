@@ -1,5 +1,6 @@
 """Versions on an object store: whole or not there, a number for each run, and leftovers of dead runs removed."""
 
+import errno
 import json
 import os
 import socket
@@ -9,6 +10,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 from seamosaic.catalog import filesystems, publishing, versions
@@ -98,6 +100,27 @@ def test_a_number_taken_and_finished_at_the_last_moment_is_left_alone(out, tmp_p
     assert publishing.publish(made(tmp_path / "a", "ours"), place(out) / "reef", "ours").name == "v2"
     assert [version.digest for version in list_versions(out, "reef")] == ["other", "ours"]
     assert [name for name in files(out) if "claims" in name] == []
+
+
+@pytest.mark.parametrize("code", ["PreconditionFailed", "ConditionalRequestConflict", "AccessDenied"])
+def test_a_store_that_says_in_its_own_words_that_another_was_first(code):
+    """MinIO names no condition, of which s3fs makes an error like any other."""
+
+    class Other:
+        def pipe_file(self, path, data, mode):
+            raise OSError(errno.EINVAL, "At least one of the pre-conditions you specified did not hold") from Answer()
+
+        def cat_file(self, path):
+            return b"another's"
+
+    class Answer(Exception):
+        response: ClassVar = {"Error": {"Code": code}}
+
+    if code == "AccessDenied":
+        with pytest.raises(OSError, match="pre-conditions"):
+            create(Other(), "x", b"ours")
+    else:
+        assert not create(Other(), "x", b"ours")
 
 
 def test_one_of_many_creates(s3, tmp_path):

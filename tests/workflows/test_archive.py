@@ -204,6 +204,7 @@ def test_status_for_a_person_and_for_programs(archive):
         (("reprocess", "{}", "--where", "id == 'x'", "--set", "grid.cell_m=1"), "no mission"),
         (("prune", "{}/products"), "--keep-gb 0"),
         (("prune", "{}"), "--keep-gb 0"),
+        (("prune", "{}/prodcts", "--keep-gb", "0"), "prodcts: found nothing; expected a folder of products"),
     ],
 )
 def test_what_a_user_can_get_wrong_is_said(pair, arguments, said):

@@ -51,6 +51,37 @@ def test_bad_missions_do_not_stop_good_ones(archive):
     assert state_of(archive).state == "current"
 
 
+def test_a_mission_whose_id_changes_is_left_to_the_next_run(archive, monkeypatch):
+    seen = archive_run.archive_states.assess
+
+    def renamed(opened, url, ours=False):
+        found = seen(opened, url, ours)
+        return found._replace(id="another", state="new") if ours and url.endswith("m00") else found
+
+    shutil.rmtree(archive / "products/plane-0")
+    monkeypatch.setattr(archive_run.archive_states, "assess", renamed)
+    result = invoke("run", archive, "--scheduler", "sync", "--json")
+    assert result.exit_code == 1
+    outcomes = {Path(one["url"]).name: one["why"] for one in json.loads(result.stdout)["missions"]}
+    assert "its id has become another meanwhile" in outcomes["m00"]
+    assert not (archive / "products/another").exists()
+
+
+def test_a_mission_that_breaks_what_looks_at_it_is_one_of_many(archive, monkeypatch):
+    look = archive_run.archive_states.memory.look
+
+    def broken(url, out):
+        if url.endswith("m00"):
+            raise RuntimeError("surprise")
+        return look(url, out)
+
+    monkeypatch.setattr(archive_run.archive_states.memory, "look", broken)
+    states = {Path(state.url).name: (state.state, state.why) for state in assess_all(open_archive(str(archive)))}
+    assert states.pop("m00") == ("invalid", "it cannot be read: surprise")
+    assert states
+    assert "invalid" not in {state for state, _ in states.values()}
+
+
 def test_damaged_settings_are_no_defaults(archive):
     records.write_settings(f"{archive}/products", "plane-0", {"grid.cell_m": 0.05})
     path = archive / "products/plane-0/settings.json"

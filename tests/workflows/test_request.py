@@ -11,7 +11,7 @@ from seamosaic.catalog.filesystems import ObjectStoreError
 from seamosaic.catalog.images import MissingImage
 from seamosaic.catalog.store import Store
 from seamosaic.schemas.parameters import Parameters
-from seamosaic.workflows import footing, job, maps, products, request, run
+from seamosaic.workflows import footing, job, maps, products, report, request, run
 
 # What carries results but does not decide them
 NEUTRAL = {
@@ -27,7 +27,8 @@ LOADED = "import sys, seamosaic.workflows.run; print(*(name for name in sys.modu
 def test_every_module_behind_the_products_is_in_the_code_of_a_request(monkeypatch):
     """A module that is forgotten would leave versions current that its change made stale."""
     for part, deciding in (("products", products), ("opening", request), ("workflow", run)):
-        assert run.CODE[part] == job.code_version(*deciding.DECIDING)
+        pages = [report.TEMPLATE] if deciding is products else []
+        assert run.CODE[part] == job.code_version(*deciding.DECIDING, pages=pages)
     assert run._VERSIONS.items() <= run.CODE.items()
     seen = {}
     monkeypatch.setattr(job.inspect, "getsource", lambda module: seen.setdefault(module.__name__, "") and "")
