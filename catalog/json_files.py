@@ -16,10 +16,10 @@ from .filesystems import ObjectStoreError, asking, connect, create, settle
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 
 
-def read_json(url: str, *, sure: bool = False) -> Any | None:
+def read_json(url: str, *, strict: bool = False) -> Any | None:
     """What the file holds; None if there is none or it is damaged, or may not or cannot be read.
 
-    sure : raise what keeps it from being read, as it may be there.
+    strict : raise what keeps it from being read, as it may be there.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def read_json(url: str, *, sure: bool = False) -> Any | None:
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
     except OSError as error:
-        if sure or isinstance(error, ObjectStoreError):
+        if strict or isinstance(error, ObjectStoreError):
             raise
         return None
 

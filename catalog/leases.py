@@ -202,7 +202,7 @@ def _all(folder: str) -> list[tuple[int, Holder | None]]:
 
 
 def _read(url: str) -> Holder | None:
-    found: Any = json_files.read_json(url, sure=True)
+    found: Any = json_files.read_json(url, strict=True)
     try:
         return Holder(**found)
     except TypeError:

@@ -76,10 +76,10 @@ def look(url: str, out: str) -> Look:
     """
     memory, keys = recall(url, out), _keys(url)
     same = memory.state is not None and memory.state == _state(keys)
+    known = memory.look if same else None
     # images that could not be read when others were may be readable now, and look the same from outside
-    whole = memory.look is not None and not (memory.look.inputs and memory.look.unread)
-    if memory.look is not None and whole and same and _texts_same(url, memory.look.texts):
-        return memory.look
+    if known and not (known.inputs and known.unread) and _texts_same(url, known.texts):
+        return known
     opened = open_mission(url, dict(memory.images), hashed=None)
     if recall(url, out) != memory:  # a run has read the images meanwhile
         return look(url, out)

@@ -43,7 +43,7 @@ class Pruned(NamedTuple):
     failed: tuple[str, ...] = ()
 
 
-def there(out: str) -> bool:
+def exists(out: str) -> bool:
     """Whether there is such a folder."""
     filesystem, path = connect(out)
     with asking(filesystem, out):

@@ -171,14 +171,15 @@ def refine(
     depth = float(np.median([np.median(own[:, 2]) for own in lit.values()])) if lit else 3.0
     sights = sights.take(start.known[sights.image])
     fixed = _fixed(start, navigation)
-    bundle, poses, unknowns, values, every = None, start, 0, first_values(fixed, start), sights
+    bundle, poses, unknowns, values = None, start, 0, first_values(fixed, start)
     sigma_px, rough = _FIRST_SIGMA_PX, laser_ranges.FIRST_ROUGHNESS
+    anew = {}
     if navigation is not None:  # without, each image must be held from the start
+        anew[_FIRST_ROUNDS] = sights
         sights = tracks.thin(sights, (camera.height, camera.width), -(-p.tie_cells // 2), 1)
     for number, (gate_px, tolerance) in enumerate(zip(_GATES_PX, _TOLERANCES, strict=True)):
         gate_px = max(gate_px, _GATE_SIGMAS * sigma_px)
-        if number == _FIRST_ROUNDS and navigation is not None:
-            sights = every
+        sights = anew.get(number, sights)
         sights, x, X, pixels = _inliers(camera, poses, sights, depth, gate_px)
         crossed = crossovers.believable(crossovers.find(poses, lines), unknowns)
         if not len(X) and not len(crossed.i):

@@ -233,7 +233,7 @@ def prune(
     if limit is None:
         remedy = "Add --keep-gb 0 to free everything, or keep_gb to archive.yaml."
         raise InvalidInput([Problem("--keep-gb", None, "", "nothing", "how many gigabytes may stay", remedy)])
-    if out == place and not pruning.there(out):
+    if out == place and not pruning.exists(out):
         remedy = "Name an archive, or the folder that runs were given with -o."
         raise InvalidInput([Problem(out, None, "", "nothing", "a folder of products", remedy)])
     pruned = pruning.prune(out, limit * 1e9, dry_run=dry_run)

@@ -10,8 +10,9 @@ import numpy as np
 
 from ..tasks import dense, dense_cells, dense_refine, laser, tiepoints
 from ..tasks.dense_cells import PairCells
+from ..tasks.navigation import Poses
 from . import extract, match, solve
-from .job import Done, Made, code_version, load, once, rounded_digest, stage
+from .job import Done, Job, Made, code_version, load, once, rounded_digest, stage
 from .maps_inputs import Image, MapJob, Pair, pose_digest
 from .solve import Solution
 
@@ -43,9 +44,7 @@ def ties_batch(m: MapJob, batch: Sequence[Pair]) -> list[Done]:
 
     def one(pair: Pair) -> Done:
         def make() -> Made:
-            arrays = load(m.job, match.STEP, pair.key, ("uv_i", "uv_j")).arrays
-            uv_i, uv_j = (arrays[name].astype(float) for name in ("uv_i", "uv_j"))
-            points = tiepoints.triangulate(camera, uv_i, uv_j, poses, pair.i, pair.j)
+            points = triangulated(m.job, poses, pair.i, pair.j, pair.key)
             return Made(points._asdict(), {"points": len(points.X_local)})
 
         both = [pair.i, pair.j]
@@ -53,6 +52,13 @@ def ties_batch(m: MapJob, batch: Sequence[Pair]) -> list[Done]:
         return once(m.job, TIES, _VERSION, inputs, stage(camera), make)
 
     return [one(pair) for pair in batch]
+
+
+def triangulated(job: Job, poses: Poses, i: int, j: int, key: str) -> tiepoints.TiePoints:
+    """The matches of two images, by the key of their matching."""
+    arrays = load(job, match.STEP, key, ("uv_i", "uv_j")).arrays
+    uv_i, uv_j = (arrays[name].astype(float) for name in ("uv_i", "uv_j"))
+    return tiepoints.triangulate(job.calibration.camera, uv_i, uv_j, poses, i, j)
 
 
 def dense_batch(m: MapJob, batch: Sequence[DensePair]) -> list[Done]:

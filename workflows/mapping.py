@@ -7,10 +7,10 @@ import numpy as np
 from dask.delayed import Delayed, delayed
 
 from ..tasks import camera as cameras
-from ..tasks import grids, pairs, tiepoints
+from ..tasks import grids, pairs
 from ..tasks.grids import Grid
-from . import dense, layers, maps, match, meshing, mosaics
-from .job import Done, load
+from . import dense, layers, maps, meshing, mosaics
+from .job import Done
 from .maps_inputs import Image, MapJob, Pair, Tile
 from .plan import batches
 from .results import Mapped, Posed, TerrainLayers, Tiles
@@ -440,9 +440,7 @@ def _heights_by_matches(state: Session, matched: Sequence[tuple[int, int, Done]]
     poses, found = solution.poses, np.full(len(solution.poses.known), np.nan)
     linked = [(i, j, done) for i, j, done in matched if done.info["model"] and poses.known[[i, j]].all()]
     for i, j, done in linked[:: -(-len(linked) // _HEIGHT_PAIRS) or 1]:
-        arrays = load(state.job, match.STEP, done.key, ("uv_i", "uv_j")).arrays
-        uv_i, uv_j = (arrays[name].astype(float) for name in ("uv_i", "uv_j"))
-        X = tiepoints.triangulate(state.job.calibration.camera, uv_i, uv_j, poses, i, j).X_local
+        X = dense.triangulated(state.job, poses, i, j, done.key).X_local
         for row in (i, j) if len(X) else ():
             found[row] = np.median((X - poses.C_local[row]) @ poses.R_local_camera[row, :, 2])
     return found

@@ -1,7 +1,7 @@
 """Per map tile: soundings to cells, cells to surface. What touches a tile decides its digest."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -244,7 +244,8 @@ def coarse_tile(m: MapJob, tile: Grid, neighbours: Sequence[tuple[Grid, Done]]) 
 
     def make() -> Made:
         layers: dict[str, np.ndarray] = {}
-        for block in _blocks(tile, _FINE_CELLS * usual / tile.cell_m):
+        size = max(1, int(_FINE_CELLS * usual / tile.cell_m))
+        for block in grids.tiles(tile, min(size, m.job.parameters.grid.tile_cells)):
             for name, values in part(block)._asdict().items():
                 values = values.astype(np.float32) if values.dtype == float else values
                 layers.setdefault(name, np.zeros(tile.shape, values.dtype))
@@ -260,17 +261,6 @@ def _cells(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]], noise_scale
 
 def _window_m(tiles: Sequence[tuple[Grid, Done]]) -> float:
     return max((done.info["window_m"] for _, done in tiles), default=0.0)
-
-
-def _blocks(tile: Grid, most: float) -> Iterator[Grid]:
-    """A tile halved until no part has more cells across."""
-    size = max(tile.shape)
-    while size > max(most, 1):
-        size = -(-size // 2)
-    for row in range(0, tile.height, size):
-        for column in range(0, tile.width, size):
-            rows, columns = min(size, tile.height - row), min(size, tile.width - column)
-            yield Grid(tile.cell_m, tile.left + column, tile.top - row, columns, rows)
 
 
 def _gridded(job: Job, grid: Grid, tiles: Sequence[tuple[Grid, Done]], prefix: str = "") -> Cells:

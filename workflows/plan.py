@@ -182,12 +182,9 @@ def misplaced_pairs(
     found, guessed = [], not np.isfinite(opened.frames["altitude"].values).any()
     for i, j in _overlapping(made, opened, parameters, poses, range_m, _margin(made.prior)):
         off, above = float(np.linalg.norm(moved[j] - moved[i])), float(range_m[i])
-        if (i, j) in linked or not (guessed or off > NEAR_SHARE * above):
-            continue
-        if guessed:
-            found.append(Wanted(i, j, above, lit.get(i, ()), lit.get(j, ())))
-        elif off > margin_m(navigation.relative(corrected, i, j), above):
-            found.append(Wanted(i, j, above, lit.get(i, ()), lit.get(j, ()), free=True))
+        far = off > NEAR_SHARE * above and off > margin_m(navigation.relative(corrected, i, j), above)
+        if (i, j) not in linked and (far or guessed):
+            found.append(Wanted(i, j, above, lit.get(i, ()), lit.get(j, ()), free=far))
     return found
 
 

@@ -62,6 +62,8 @@ def test_a_saturated_line_is_measured_by_its_flanks(height: float, width_px: flo
     assert (made.image[..., 1] == 255).sum() > 3 * made.camera.height
     error = errors(line, made)
     assert len(line.uv) > 0.95 * visible(made)
+    assert abs(error.mean()) < 0.02
+    assert error.std() < 0.15
     assert abs(np.median(error)) < 0.01
     # beside the crossing the other arm hides a flank, and sigma says so
     assert 0.005 < 1.4826 * np.median(np.abs(error)) < 0.06

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from seamosaic.tasks import grids
 from seamosaic.tasks.grids import Grid
-from seamosaic.workflows import mapping, maps, products
+from seamosaic.workflows import mapping, products
 from seamosaic.workflows.job import Done
 from seamosaic.workflows.maps_inputs import Image, Pair
 
@@ -89,15 +89,3 @@ def test_heights_are_the_lasers_then_the_altimeters_then_those_around(altitude: 
 )
 def test_why_there_is_no_image(status: list[str], expected: str):
     assert mapping._no_images(status).startswith(expected)
-
-
-def test_a_tile_is_halved_into_blocks_that_cover_it_once():
-    tile = Grid(0.5, -3, 40, 37, 21)
-    count = np.zeros(tile.shape, int)
-    blocks = list(maps._blocks(tile, 10))
-    for block in blocks:
-        assert max(block.shape) <= 10
-        count[grids.window(tile, block)] += 1
-    assert (count == 1).all()
-    assert list(maps._blocks(tile, 1000)) == [tile]
-    assert sum(1 for _ in maps._blocks(Grid(0.5, 0, 3, 3, 3), 0.2)) == 9
