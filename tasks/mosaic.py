@@ -13,6 +13,7 @@ removed) is spread over a much wider seam, by their thumbnails: the two bands of
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
@@ -34,6 +35,7 @@ from .nodes import (
     Shot,
     quality_cost,
     quality_scale,
+    sample,
     see,
     small_at,
     upsample,
@@ -51,6 +53,7 @@ _REACH_FEATHERS: Final = 6.3  # what costs so much more than another has less th
 _WIDE_FEATHERS: Final = 8  # of the seam between thumbnails
 _MOST_EVENED: Final = 1.5
 _WEIGHTS: Final = 255
+_SHARES: Final = (np.arange(_WEIGHTS + 1) / _WEIGHTS).astype(np.float32)
 _LEVELS: Final = 65535
 _DARKEST: Final = 1e-4
 _PAINT_KNOWN: Final = 1e-3
@@ -62,14 +65,19 @@ class Patch(NamedTuple):
     Attributes
     ----------
     row, column : of the block in the tile.
-    weight : (128, 128) uint8, of 255; None where the image is alone.
+    part : rows and columns of the block's pixels in which it counts, whole steps of nodes.
+    weight : of the part, uint8, of 255; None where the image is alone.
     painted : whether pixels are needed that the laser lights.
     """
 
     row: int
     column: int
+    part: tuple[slice, slice]
     weight: Pixels | None
     painted: bool
+
+
+_WHOLE: Final = slice(0, BLOCK), slice(0, BLOCK)
 
 
 class Laid(NamedTuple):
@@ -97,6 +105,21 @@ class Plan(NamedTuple):
     laid: tuple[Laid, ...]
     source: NDArray[np.int32]
     painted: Mask
+
+
+class Canvas(NamedTuple):
+    """A tile while images are laid on it.
+
+    Attributes
+    ----------
+    rgb : (3, rows, columns of its blocks) uint8, of the blocks that have all their images.
+    waiting : of each block the images that are still to come.
+    sums : (128, 128, 3) light of the blocks that have some.
+    """
+
+    rgb: Pixels
+    waiting: Counter[tuple[int, int]]
+    sums: dict[tuple[int, int], Array32]
 
 
 class Mosaic(NamedTuple):
@@ -148,7 +171,7 @@ def plan(
 def _part(place: Ground, seen: Seen) -> tuple[slice, slice]:
     """The tile's nodes that an image's arrays are of."""
     row, column = seen.row * BLOCK // place.step, seen.column * BLOCK // place.step
-    return slice(row, row + seen.u.shape[0]), slice(column, column + seen.u.shape[1])
+    return slice(row, row + seen.cost.shape[0]), slice(column, column + seen.cost.shape[1])
 
 
 def _upper_bound(place: Ground, views: Sequence[tuple[Shot, Seen]], feather_m: float) -> Array32:
@@ -203,32 +226,53 @@ def _share_out(
 ) -> tuple[NDArray[np.int32] | int, Mask | bool]:
     """Weights of the images in a block, added to their patches; of each pixel the image and whether it is painted."""
     if len(rivals) == 1 and _clean(place, views[rivals[0]][1], block):
-        patches[rivals[0]].append(Patch(*block, None, False))
+        patches[rivals[0]].append(Patch(*block, _WHOLE, None, False))
         return views[rivals[0]][0].number, False
     costs = [_pixel_cost(place, *views[k], block, feather_m) for k in rivals]
     lowest, first = _lowest(costs)
     seen_at_all = np.isfinite(lowest)
-    weights = [cv2.exp((np.where(seen_at_all, lowest, 0) - cost) / np.float32(feather_m)) for cost in costs]
-    scale = np.float32(_WEIGHTS) / np.maximum(sum(weights), np.float32(1))
-    shares = [np.floor(weight * scale).astype(np.int16) for weight in weights]  # never more than there is
-    rest = np.where(seen_at_all, _WEIGHTS - sum(shares), 0)
-    for place_in_line, (k, share, cost) in enumerate(zip(rivals, shares, costs, strict=True)):
-        share = share + np.where(first == place_in_line, rest, 0)
-        if share.any():
-            painted = bool(((cost >= ERASED_M) & (share > 0)).any())
-            patches[k].append(Patch(*block, share.astype(np.uint8), painted))
+    lowest = np.where(seen_at_all, lowest, np.float32(0))
+    is_lit = bool((lowest >= ERASED_M).any())
+    for k, share, cost in zip(rivals, _shares(costs, lowest, first, seen_at_all, feather_m), costs, strict=True):
+        part = _counting(share, place.step)
+        if part is not None:
+            painted = is_lit and bool(((cost >= ERASED_M) & (share > 0)).any())
+            patches[k].append(Patch(*block, part, share[part], painted))
     numbers = np.array([views[k][0].number for k in rivals], np.int32)
-    lit = _lit(place, [views[k] for k in rivals], block, first) if (lowest >= ERASED_M).any() else False
-    return np.where(seen_at_all, numbers[first], np.int32(-1)), lit & seen_at_all
+    lit = _lit(place, [views[k] for k in rivals], block, first) if is_lit else False
+    return np.where(seen_at_all, numbers.take(first), np.int32(-1)), lit & seen_at_all
 
 
-def _lowest(costs: Sequence[Array32]) -> tuple[Array32, NDArray[np.uint16]]:
+def _lowest(costs: Sequence[Array32]) -> tuple[Array32, NDArray[np.intp]]:
     """The lowest of costs, pixel by pixel, and which of them it is."""
-    lowest, first = costs[0], np.zeros(costs[0].shape, np.uint16)
+    lowest, first = costs[0], np.zeros(costs[0].shape, np.intp)
     for k, cost in enumerate(costs[1:], 1):
-        first[cost < lowest] = k
+        np.copyto(first, k, where=cost < lowest)
         lowest = np.minimum(lowest, cost)
     return lowest, first
+
+
+def _shares(
+    costs: Sequence[Array32], lowest: Array32, first: NDArray[np.intp], seen_at_all: Mask, feather_m: float
+) -> Iterator[Pixels]:
+    """Weights of images by their costs, which add up to 255 where any sees the place: what rounding leaves is the
+    best image's."""
+    weights = [cv2.exp((lowest - cost) * np.float32(1 / feather_m)) for cost in costs]
+    scale = np.float32(_WEIGHTS) / np.maximum(sum(weights), np.float32(1))
+    shares = [(weight * scale).astype(np.uint8) for weight in weights]  # never more than there is
+    rest = np.uint8(_WEIGHTS) * seen_at_all - sum(shares)
+    for k, share in enumerate(shares):
+        yield share + rest * (first == k)
+
+
+def _counting(share: Pixels, step: int) -> tuple[slice, slice] | None:
+    """Rows and columns, in whole steps, beyond which an image's share is 0; None where it is so everywhere."""
+    left, top, width, height = cv2.boundingRect(share)
+    if not width:
+        return None
+    edges = (top, top + height), (left, left + width)
+    rows, columns = (slice(first // step * step, -(-end // step) * step) for first, end in edges)
+    return rows, columns
 
 
 def _clean(place: Ground, seen: Seen, block: tuple[int, int]) -> bool:
@@ -242,7 +286,7 @@ def _pixel_cost(place: Ground, shot: Shot, seen: Seen, block: tuple[int, int], f
     cost = upsample(seen.cost[at], place.step)
     if not (seen.quality[at] == BEST).all():
         cost = cost + quality_cost(_pixel_quality(place, shot, seen, block, shot.quality), feather_m)
-    return np.where(np.isfinite(cost), cost, np.float32(np.inf))
+    return np.fmin(cost, np.float32(np.inf))  # NaN is inf
 
 
 def _pixel_quality(
@@ -250,16 +294,15 @@ def _pixel_quality(
 ) -> Pixels:
     """Of an image of qualities, or one like it, the values (128, 128) in a block."""
     at, scale = _block_nodes(place, seen, *block), quality_scale(shot.camera)
-    u, v = (upsample((w[at] + np.float32(0.5)) / scale - np.float32(0.5), place.step) for w in (seen.u, seen.v))
-    found = cv2.remap(quality, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[beyond])
-    return np.asarray(found, np.uint8)
+    uv = upsample((seen.uv[at] + np.float32(0.5)) / scale - np.float32(0.5), place.step)
+    return np.asarray(sample(quality, uv, beyond), np.uint8)
 
 
-def _lit(place: Ground, views: Sequence[tuple[Shot, Seen]], block: tuple[int, int], first: NDArray[np.uint16]) -> Mask:
+def _lit(place: Ground, views: Sequence[tuple[Shot, Seen]], block: tuple[int, int], first: NDArray[np.intp]) -> Mask:
     """Pixels of a block that the laser lights in the image, by its place in views, that is shown there."""
     lit = np.zeros(first.shape, bool)
     for k, (shot, seen) in enumerate(views):
-        erased = np.where(shot.quality == ERASED, np.uint8(255), np.uint8(0))
+        erased = np.asarray(cv2.inRange(shot.quality, np.array(ERASED), np.array(ERASED)), np.uint8)
         lit |= (first == k) & (_pixel_quality(place, shot, seen, block, erased, 0) > 0)
     return lit
 
@@ -334,18 +377,20 @@ def compose(plans: Sequence[Plan], read: Read, reductions: dict[int, int], gamma
     gamma : level = light ** (1 / gamma).
     """
     light = ((np.arange(256) / 255) ** gamma).astype(np.float32)
-    sums = [np.zeros((*p.place.blocks.shape, 3), np.float32) for p in plans]
+    levels = np.rint(255 * (np.arange(_LEVELS + 1) / _LEVELS) ** (1 / gamma)).astype(np.uint8)
+    canvases = [_canvas(p) for p in plans]
     for number, parts in _by_number(plans):
         times, shot = reductions[number], parts[0][1].shot
         image = picture(shot, read, times)
         painted = image if times > _finest(shot) else None
         for k, laid in parts:
+            at = (laid.seen.uv + np.float32(0.5)) * np.float32(1 / times) - np.float32(0.5)
             for patch in laid.patches:
                 if patch.painted and painted is None:
                     painted = paint_over(image, laid.shot.quality == ERASED)
                 source = painted if patch.painted and painted is not None else image
-                _lay(sums[k], plans[k].place, laid, patch, source, times, light)
-    return [_finish(p, total, gamma) for p, total in zip(plans, sums, strict=True)]
+                _lay(canvases[k], patch, _colours(plans[k].place, laid, patch, source, at, light), levels)
+    return [_finish(p, canvas) for p, canvas in zip(plans, canvases, strict=True)]
 
 
 def picture(shot: Shot, read: Read, times: int) -> Pixels:
@@ -373,35 +418,53 @@ def _by_number(plans: Sequence[Plan]) -> Iterator[tuple[int, list[tuple[int, Lai
     yield from sorted(found.items())
 
 
-def _lay(total: Array32, place: Ground, laid: Laid, patch: Patch, image: Pixels, times: int, light: Array32) -> None:
-    """Adds an image's colours to a block, as light."""
-    nodes = _block_nodes(place, laid.seen, patch.row, patch.column)
-    u, v = (
-        upsample((w[nodes] + np.float32(0.5)) / times - np.float32(0.5), place.step) for w in (laid.seen.u, laid.seen.v)
-    )
-    colour = cv2.LUT(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), light)
-    if laid.gain is not None and laid.veil is not None:
-        colour = cv2.subtract(
-            cv2.multiply(colour, upsample(laid.gain[nodes], place.step)), upsample(laid.veil[nodes], place.step)
-        )
-    at = total[patch.row * BLOCK : (patch.row + 1) * BLOCK, patch.column * BLOCK : (patch.column + 1) * BLOCK]
+def _colours(place: Ground, laid: Laid, patch: Patch, image: Pixels, at: Array32, light: Array32) -> Array32:
+    """An image's colours (..., 3) in a patch, as light, by where (rows, columns, 2) its nodes are in the image."""
+    nodes = _patch_nodes(place, laid.seen, patch)
+    colour = cv2.LUT(sample(image, upsample(at[nodes], place.step)), light)
+    if laid.gain is None or laid.veil is None:
+        return np.asarray(colour, np.float32)
+    gain, veil = (upsample(values[nodes], place.step) for values in (laid.gain, laid.veil))
+    return np.asarray(cv2.subtract(cv2.multiply(colour, gain), veil), np.float32)
+
+
+def _patch_nodes(place: Ground, seen: Seen, patch: Patch) -> tuple[slice, slice]:
+    """Of an image's arrays those nodes that a patch is interpolated from."""
+
+    def within(block: slice, part: slice) -> slice:
+        return slice(block.start + part.start // place.step, block.start + part.stop // place.step + 2)
+
+    rows, columns = _block_nodes(place, seen, patch.row, patch.column)
+    return within(rows, patch.part[0]), within(columns, patch.part[1])
+
+
+def _canvas(made: Plan) -> Canvas:
+    waiting = Counter((patch.row, patch.column) for laid in made.laid for patch in laid.patches)
+    return Canvas(np.zeros((3, *made.place.blocks.shape), np.uint8), waiting, {})
+
+
+def _lay(canvas: Canvas, patch: Patch, colour: Array32, levels: Pixels) -> None:
+    """Adds an image's colours to a block, as light, and makes levels of it once it has all."""
+    block = patch.row, patch.column
+    total = canvas.sums.pop(block, None)
     if patch.weight is None:
-        at[:] = colour
+        total = colour
     else:
-        share = np.multiply(patch.weight, np.float32(1 / _WEIGHTS), dtype=np.float32)
-        at += cv2.multiply(colour, cv2.merge([share] * 3))
+        total = np.zeros((BLOCK, BLOCK, 3), np.float32) if total is None else total
+        total[patch.part] += cv2.multiply(colour, cv2.LUT(cv2.merge([patch.weight] * 3), _SHARES))
+    canvas.waiting[block] -= 1
+    if canvas.waiting[block]:
+        canvas.sums[block] = total
+    else:
+        rows, columns = (slice(n * BLOCK, (n + 1) * BLOCK) for n in block)
+        canvas.rgb[:, rows, columns] = cv2.split(cv2.LUT(_as_16_bits(total), levels))
 
 
-def _finish(made: Plan, total: Array32, gamma: float) -> Mosaic:
-    """Light to levels."""
+def _finish(made: Plan, canvas: Canvas) -> Mosaic:
+    """The tile without what its blocks have beyond it."""
     at = window(made.place.blocks, made.tile)
-    levels = np.rint(255 * (np.arange(_LEVELS + 1) / _LEVELS) ** (1 / gamma)).astype(np.uint8)
-    light, source = total[at], made.source[at]
-    rgb = np.empty((3, *source.shape), np.uint8)
-    for row in range(0, len(light), BLOCK):  # what is worked on stays in the processor's cache
-        rows = slice(row, row + BLOCK)
-        rgb[:, rows] = cv2.split(cv2.LUT(_as_16_bits(light[rows]), levels))
-    return Mosaic(rgb, source >= 0, np.ascontiguousarray(source), np.ascontiguousarray(made.painted[at]))
+    source = np.ascontiguousarray(made.source[at])
+    return Mosaic(np.ascontiguousarray(canvas.rgb[:, *at]), source >= 0, source, np.ascontiguousarray(made.painted[at]))
 
 
 def _as_16_bits(light: NDArray) -> NDArray[np.uint16]:

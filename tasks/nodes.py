@@ -6,7 +6,7 @@ interpolation (`upsample`).
 """
 
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -89,7 +89,7 @@ class Seen(NamedTuple):
     Attributes
     ----------
     row, column : of the first block.
-    u, v : pixel.
+    uv : pixel (rows, columns, 2).
     range_m : from the centre of projection.
     cost : of being shown, m, but for its pixel's quality.
     quality : lowest of the pixels around, uint8.
@@ -97,11 +97,20 @@ class Seen(NamedTuple):
 
     row: int
     column: int
-    u: Array32
-    v: Array32
+    uv: Array32
     range_m: Array32
     cost: Array32
     quality: Pixels
+
+    @property
+    def u(self) -> Array32:
+        """Columns (rows, columns)."""
+        return self.uv[..., 0]
+
+    @property
+    def v(self) -> Array32:
+        """Rows (rows, columns)."""
+        return self.uv[..., 1]
 
 
 def block_grid(tile: Grid) -> Grid:
@@ -152,6 +161,13 @@ def upsample(values: NDArray, step: int) -> NDArray:
     return cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)[step:-step, step:-step]
 
 
+def sample(image: NDArray, uv: Array32, beyond: float | None = None) -> NDArray:
+    """An image at its pixels uv (rows, columns, 2), bilinear; outside of it beyond, or as at its rim."""
+    mode = cv2.BORDER_REPLICATE if beyond is None else cv2.BORDER_CONSTANT
+    no_second_map: Any = None  # which OpenCV's type stubs ask for
+    return cv2.remap(image, uv, no_second_map, cv2.INTER_LINEAR, borderMode=mode, borderValue=[beyond or 0.0] * 4)
+
+
 def quality_scale(camera: Camera) -> int:
     """Pixels of an image to a pixel of its image of qualities."""
     return max(1, camera.width // _QUALITY_WIDTH)
@@ -170,7 +186,7 @@ def qualities(erase: Mask, scale: int) -> Pixels:
 
 def quality_cost(quality: Pixels, feather_m: float) -> Array32:
     """Metres that pixels cost by their quality; inf outside of the image."""
-    return _quality_costs(feather_m)[quality]
+    return np.asarray(cv2.LUT(quality, _quality_costs(feather_m)), np.float32)
 
 
 @lru_cache(maxsize=4)
@@ -210,7 +226,7 @@ def see(place: Ground, shot: Shot, lie: Lie, feather_m: float) -> Seen | None:
         C = -np.linalg.inv(lie.A) @ lie.b
         cost += _oblique(place, at, nodes, C) + _hiding(place, nodes, C, feather_m)
     quality = _quality_around(place, shot, u, v, float(np.median(Z[shown])))
-    return Seen(row, column, u, v, range_m.astype(np.float32), cost.astype(np.float32), quality)
+    return Seen(row, column, np.dstack([u, v]), range_m.astype(np.float32), cost.astype(np.float32), quality)
 
 
 def _pixels_or_nan(table: Departure, X: Array, Y: Array, Z: Array) -> tuple[Array32, Array32]:
