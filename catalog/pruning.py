@@ -1,12 +1,15 @@
 """Frees intermediate results, least recently used first; products are never touched."""
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 from fsspec import AbstractFileSystem
 from fsspec.implementations.local import LocalFileSystem
+from numpy.typing import NDArray
 
 from . import json_files, leases
 from .filesystems import ObjectStoreError, asking, connect, is_glob
@@ -20,7 +23,6 @@ _MODIFIED: Final = ("mtime", "LastModified", "last_modified", "updated", "create
 class Entry(NamedTuple):
     """A stored result, or what a killed run left of one. used_s : when it was last made or used, POSIX seconds."""
 
-    mission_id: str
     path: str
     size: int
     used_s: float
@@ -54,24 +56,66 @@ def prune(out: str, keep_bytes: float, *, dry_run: bool = False, term_s: float =
     """Remove intermediate results until what is left of them in OUT is no more than keep_bytes.
 
     What killed runs left half-written goes first, then what was not used for longest. While a mission's results are
-    removed, its lease is held; one that a run is at work on is left alone.
+    removed, its lease is held; one that a run is at work on is left alone. Of all missions together only sizes and
+    times are held in memory; a mission's results are listed again when it is its turn.
     """
     filesystem, _ = connect(out)
-    entries = [entry for mission_id in json_files.names(out) for entry in _entries(filesystem, out, mission_id)]
-    before = sum(entry.size for entry in entries)
-    missions = {entry.mission_id for entry in entries}
-    busy = {mission_id for mission_id in missions if leases.holder(out, mission_id)}
-    chosen = _choose([entry for entry in entries if entry.mission_id not in busy], before - keep_bytes)
-    freed, failed = [], []
-    for mission_id, some in chosen.items():
-        try:
-            gone, why = (some, "") if dry_run else _free(filesystem, out, mission_id, some, term_s)
-        except leases.Busy:
-            busy.add(mission_id)
+    stocks = {name: _stock(_entries(filesystem, out, name)) for name in json_files.names(out)}
+    before = sum(int(stock.size.sum()) for stock in stocks.values())
+    busy = {name for name, stock in stocks.items() if len(stock.size) and leases.holder(out, name)}
+    limit, rest = _limit([stock for name, stock in stocks.items() if name not in busy], before - keep_bytes)
+    count, freed, failed = 0, 0, []
+    for name, stock in stocks.items():
+        if name in busy or not (stock.order <= limit).any():
             continue
-        freed += gone
-        failed += [f"{mission_id}: {why}"] if why else []
-    return Pruned(before, sum(entry.size for entry in freed), len(freed), tuple(sorted(busy)), tuple(failed))
+        some, rest = _choose(_entries(filesystem, out, name), limit, rest)
+        try:
+            gone, why = _free(filesystem, out, name, some, term_s) if some and not dry_run else (some, "")
+        except leases.Busy:
+            busy.add(name)
+            continue
+        count, freed = count + len(gone), freed + sum(entry.size for entry in gone)
+        failed += [f"{name}: {why}"] if why else []
+    return Pruned(before, freed, count, tuple(sorted(busy)), tuple(failed))
+
+
+class _Stock(NamedTuple):
+    """A mission's results: bytes (N,), and the order (N,) in which they go."""
+
+    size: NDArray[np.int64]
+    order: NDArray[np.float64]
+
+
+def _stock(entries: Sequence[Entry]) -> _Stock:
+    return _Stock(np.array([entry.size for entry in entries], np.int64), np.array([_order(e) for e in entries], float))
+
+
+def _order(entry: Entry) -> float:
+    """Half-written ones first, then by the time of use."""
+    return -math.inf if entry.path.split("/")[-2] == _SCRATCH else entry.used_s
+
+
+def _limit(stocks: Sequence[_Stock], excess: float) -> tuple[float, float]:
+    """The order up to which results go, so that excess bytes do; and how many bytes of those that are at it."""
+    order = np.concatenate([np.zeros(0), *(stock.order for stock in stocks)])
+    size = np.concatenate([np.zeros(0, np.int64), *(stock.size for stock in stocks)])
+    if excess <= 0 or not len(order):
+        return -math.inf, math.inf
+    sequence = np.argsort(order, kind="stable")
+    enough = int(np.searchsorted(np.cumsum(size[sequence]), excess))
+    limit = float(order[sequence[min(enough, len(order) - 1)]])
+    return limit, math.inf if limit == -math.inf else excess - float(size[order < limit].sum())
+
+
+def _choose(entries: Sequence[Entry], limit: float, rest: float) -> tuple[list[Entry], float]:
+    """Those of a mission that go, and how many bytes of others at the limit are to go."""
+    chosen = []
+    for entry in entries:
+        at = _order(entry) == limit and rest > 0
+        if at or _order(entry) < limit:
+            chosen.append(entry)
+            rest -= entry.size if at else 0
+    return chosen, rest
 
 
 def _free(
@@ -92,26 +136,12 @@ def _entries(filesystem: AbstractFileSystem, out: str, mission_id: str) -> list[
     _, folder = connect(f"{out.rstrip('/')}/{mission_id}/{STEPS}")
     with asking(filesystem, folder):
         found: Any = filesystem.find(folder, detail=True)
-    return [Entry(mission_id, path, int(info["size"] or 0), _used_s(info)) for path, info in found.items()]
+    return [Entry(path, int(info["size"] or 0), _used_s(info)) for path, info in found.items()]
 
 
 def _used_s(info: Mapping[str, Any]) -> float:
     when = next((info[name] for name in _MODIFIED if info.get(name) is not None), 0.0)
     return when.timestamp() if isinstance(when, datetime) else float(when)
-
-
-def _choose(entries: Sequence[Entry], excess: float) -> dict[str, list[Entry]]:
-    """What to remove, by mission."""
-    chosen: dict[str, list[Entry]] = {}
-    for entry in sorted(entries, key=lambda entry: (not _is_half(entry.path), entry.used_s)):
-        if excess > 0 or _is_half(entry.path):
-            chosen.setdefault(entry.mission_id, []).append(entry)
-            excess -= entry.size
-    return chosen
-
-
-def _is_half(path: str) -> bool:
-    return path.split("/")[-2] == _SCRATCH
 
 
 def _remove(filesystem: AbstractFileSystem, paths: Sequence[str], lease: leases.Lease) -> str:

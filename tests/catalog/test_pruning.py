@@ -1,5 +1,6 @@
 """Pruning frees what was not used for longest, and nothing else."""
 
+import gc
 import os
 import time
 
@@ -43,6 +44,28 @@ def test_what_was_used_last_stays(out):
     assert (pruned.before, pruned.freed, pruned.entries, pruned.busy) == (6 * one, 4 * one, 4, ())
     assert len(list(out.rglob("bathymetry.tif"))) == 2
     assert pruning.prune(str(out), 2.5 * one).entries == 0
+
+
+def test_of_results_used_at_the_same_time_no_more_go_than_must(out):
+    for path in out.rglob("*.npz"):
+        os.utime(path, (1e9, 1e9))
+    one = size_of_one(out)
+    assert pruning.prune(str(out), 3.5 * one).entries == 3
+    assert len(left(out)) == 3
+
+
+def test_no_listing_of_all_missions_is_held(out, monkeypatch):
+    """What it holds of results while it looks at all missions is sizes and times."""
+    held, entries = [], pruning._entries
+
+    def listing(*given):
+        held.append(sum(isinstance(one, pruning.Entry) for one in gc.get_objects()))
+        return entries(*given)
+
+    monkeypatch.setattr(pruning, "_entries", listing)
+    assert pruning.prune(str(out), 0).entries == 6
+    looks = len(list(out.iterdir()))
+    assert held[:looks] == [0] * looks
 
 
 def test_use_counts_not_age(out):
