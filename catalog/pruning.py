@@ -68,12 +68,14 @@ def prune(out: str, keep_bytes: float, *, dry_run: bool = False, term_s: float =
     for name, stock in stocks.items():
         if name in busy or not (stock.order <= limit).any():
             continue
-        some, rest = _choose(_entries(filesystem, out, name), limit, rest)
         try:
+            some, rest = _choose(_entries(filesystem, out, name), limit, rest)
             gone, why = _free(filesystem, out, name, some, term_s) if some and not dry_run else (some, "")
         except leases.Busy:
             busy.add(name)
             continue
+        except OSError as error:
+            gone, why = [], str(error)
         count, freed = count + len(gone), freed + sum(entry.size for entry in gone)
         failed += [f"{name}: {why}"] if why else []
     return Pruned(before, freed, count, tuple(sorted(busy)), tuple(failed))
@@ -122,12 +124,9 @@ def _free(
     filesystem: AbstractFileSystem, out: str, mission_id: str, some: Sequence[Entry], term_s: float
 ) -> tuple[list[Entry], str]:
     """Remove results of a mission: those that are gone, and why others are not."""
-    try:
-        with leases.take(out, mission_id, "prune", term_s) as lease:
-            why = _remove(filesystem, [entry.path for entry in some], lease)
-            left = {entry.path for entry in _entries(filesystem, out, mission_id)}  # a store may refuse in silence
-    except OSError as error:
-        return [], str(error)
+    with leases.take(out, mission_id, "prune", term_s) as lease:
+        why = _remove(filesystem, [entry.path for entry in some], lease)
+        left = {entry.path for entry in _entries(filesystem, out, mission_id)}  # a store may refuse in silence
     gone = [entry for entry in some if entry.path not in left]
     return gone, why or ("" if len(gone) == len(some) else f"{len(some) - len(gone)} results cannot be deleted")
 

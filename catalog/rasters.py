@@ -7,6 +7,7 @@ map coordinates (x of the left edge = left * cell_m, y of the top edge = top * c
 import math
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, Literal, NamedTuple, Self
 from uuid import uuid4
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from rasterio import Affine
 from rasterio.crs import CRS
 from rasterio.enums import Resampling as Resampled
+from rasterio.errors import StatisticsError
 from rasterio.io import DatasetWriter
 from rasterio.shutil import copy as gdal_copy
 from rasterio.vrt import WarpedVRT
@@ -221,13 +223,19 @@ class RasterWriter:
             self._cog.unlink(missing_ok=True)
 
     def _add_overviews(self) -> None:
-        """As the COG driver makes them, which does it through files compressed at twice the cost."""
+        """Overviews, each half the size of the one before, rounded up, and statistics of quantities.
+
+        The COG driver would make them through other files, at twice the cost.
+        """
         with (
             rasterio.Env(SPARSE_OK_OVERVIEW=True, ZSTD_LEVEL_OVERVIEW=1, GDAL_TIFF_OVR_BLOCKSIZE=_BLOCK),
             rasterio.open(self._windows, "r+") as file,
         ):
             levels = math.ceil(math.log2(max(file.width, file.height, _BLOCK) / _BLOCK))
             file.build_overviews([2**level for level in range(1, levels + 1)], Resampled[self.layer.resampling])
+            if self.layer.resampling == "average" and not self.layer.mask:  # codes and numbers have no mean
+                with suppress(StatisticsError):  # not one cell has a value
+                    file.update_stats(approx=False)
 
     def _cog_options(self) -> dict[str, str]:
         """Lossless with a predictor for data; JPEG with an internal mask for pictures, which every GIS reads."""
@@ -235,13 +243,12 @@ class RasterWriter:
             "BLOCKSIZE": str(_BLOCK),
             "BIGTIFF": "IF_SAFER",
             "SPARSE_OK": "YES",  # what a survey leaves empty of its rectangle costs nothing
-            "OVERVIEW_RESAMPLING": self.layer.resampling,
+            "OVERVIEWS": "FORCE_USE_EXISTING",
             "NUM_THREADS": "ALL_CPUS",
         }
         if self.layer.mask:
             return common | {"COMPRESS": "JPEG", "QUALITY": str(_JPEG_QUALITY), "OVERVIEW_QUALITY": str(_JPEG_QUALITY)}
-        quantity = "YES" if self.layer.resampling == "average" else "NO"  # codes and numbers have no mean
-        return common | {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "STATISTICS": quantity}
+        return common | {"COMPRESS": "DEFLATE", "PREDICTOR": "YES"}
 
 
 def gdal_settings() -> rasterio.Env:

@@ -232,14 +232,14 @@ def _share_out(
     lowest, first = _lowest(costs)
     seen_at_all = np.isfinite(lowest)
     lowest = np.where(seen_at_all, lowest, np.float32(0))
-    is_lit = bool((lowest >= ERASED_M).any())
+    no_good = bool((lowest >= ERASED_M).any())
     for k, share, cost in zip(rivals, _shares(costs, lowest, first, seen_at_all, feather_m), costs, strict=True):
         part = _counting(share, place.step)
         if part is not None:
-            painted = is_lit and bool(((cost >= ERASED_M) & (share > 0)).any())
-            patches[k].append(Patch(*block, part, share[part], painted))
+            painted = no_good and bool(((cost >= ERASED_M) & (share > 0)).any())
+            patches[k].append(Patch(*block, part, share[part].copy(), painted))
     numbers = np.array([views[k][0].number for k in rivals], np.int32)
-    lit = _lit(place, [views[k] for k in rivals], block, first) if is_lit else False
+    lit = _lit(place, [views[k] for k in rivals], block, first) if no_good else False
     return np.where(seen_at_all, numbers.take(first), np.int32(-1)), lit & seen_at_all
 
 

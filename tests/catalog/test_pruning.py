@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from fsspec.implementations.local import LocalFileSystem
 from fsspec.implementations.memory import MemoryFileSystem
-from seamosaic.catalog import leases, pruning
+from seamosaic.catalog import json_files, leases, pruning
+from seamosaic.catalog.filesystems import ObjectStoreError
 from seamosaic.catalog.store import Store
 
 KEYS = [f"{number:064x}" for number in range(6)]
@@ -64,8 +65,8 @@ def test_no_listing_of_all_missions_is_held(out, monkeypatch):
 
     monkeypatch.setattr(pruning, "_entries", listing)
     assert pruning.prune(str(out), 0).entries == 6
-    looks = len(list(out.iterdir()))
-    assert held[:looks] == [0] * looks
+    looks = len(json_files.names(str(out)))
+    assert held[:looks] == held[:1] * looks
 
 
 def test_use_counts_not_age(out):
@@ -119,6 +120,20 @@ def test_what_cannot_be_deleted_is_said_and_holds_nothing_else_up(out, monkeypat
     assert (pruned.freed, pruned.entries, left(out)) == (5 * one, 5, [5])
     (why,) = pruned.failed
     assert why.startswith("reef: [Errno 13] Permission denied")
+
+
+def test_a_mission_that_cannot_be_listed_again_holds_no_other_up(out, monkeypatch):
+    looks, entries = [], pruning._entries
+
+    def listing(filesystem, root, name):
+        looks.append(name)
+        if looks.count("reef") == 2 and name == "reef":
+            raise ObjectStoreError("reef: timed out")
+        return entries(filesystem, root, name)
+
+    monkeypatch.setattr(pruning, "_entries", listing)
+    pruned = pruning.prune(str(out), 0)
+    assert (pruned.entries, pruned.failed, left(out)) == (3, ("reef: reef: timed out",), [1, 3, 5])
 
 
 @pytest.fixture

@@ -55,6 +55,7 @@ def test_every_product_is_a_strictly_valid_cog(tmp_path, name):
         assert file.crs.to_epsg() == 32631
         if not layer.mask:
             np.testing.assert_array_equal(file.read(), ramp(name))
+        assert ("STATISTICS_MAXIMUM" in file.tags(1)) == (layer.resampling == "average" and not layer.mask)
         if layer.resampling == "average" and not layer.mask:
             assert float(file.tags(1)["STATISTICS_MAXIMUM"]) == pytest.approx(ramp(name).max(), rel=1e-5)
     files = [entry.relative_to(tmp_path).as_posix() for entry in tmp_path.rglob("*") if entry.is_file()]
@@ -120,6 +121,43 @@ def test_overviews_average_quantities_without_the_empty_cells(tmp_path):
     values[::2, ::2], values[1::2, 1::2] = -2.0, -4.0
     with rasterio.open(write(tmp_path, "bathymetry.tif", values), overview_level=0) as file:
         np.testing.assert_allclose(file.read(1), -3.0)
+
+
+@pytest.mark.parametrize("size", [(2000, 500), (3000, 1), (1025, 1301)])
+@pytest.mark.parametrize("name", ["bathymetry.tif", "density.tif", "source.tif", "mosaic.tif"])
+def test_strips_have_all_overviews_too(tmp_path, name, size):
+    path = write(tmp_path, name, ramp(name, 1, 1), size=size)
+    with rasterio.open(path) as file:
+        factors = file.overviews(1)
+    assert factors == [2**k for k in range(1, len(factors) + 1)]
+    for level, factor in enumerate(factors):
+        with rasterio.open(path, overview_level=level) as file:
+            assert (file.width, file.height) == tuple(-(-side // factor) for side in size)
+    assert max(file.width, file.height) <= 512 < 2 * max(file.width, file.height)
+
+
+def test_an_overview_is_the_mean_of_two_by_two(tmp_path):
+    values = np.random.default_rng(1).normal(-20, 5, (HEIGHT, WIDTH)).astype(np.float32)
+    with rasterio.open(write(tmp_path, "bathymetry.tif", values), overview_level=0) as file:
+        mean = values.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean((1, 3))
+        np.testing.assert_allclose(file.read(1), mean, rtol=1e-5)
+
+
+def test_overviews_of_a_picture_keep_its_colours_at_a_rim(tmp_path):
+    size, seen = (1100, 1500), np.zeros((1500, 1100), bool)
+    seen[301:1201, 203:905] = True
+    grey = np.where(seen, np.uint8(180), np.uint8(0))
+    with rasters.product_writer(tmp_path, "mosaic.tif", CELL, LEFT, TOP, *size, UTM) as writer:
+        writer.write(0, 0, np.stack([grey] * 3), seen)
+    for level, factor in enumerate((2, 4)):
+        with rasterio.open(tmp_path / "mosaic.tif", overview_level=level) as file:
+            shown = file.dataset_mask() > 0
+            inside = seen.reshape(1500 // factor, factor, 1100 // factor, factor)
+            assert (shown >= inside.all((1, 3))).all()
+            assert (shown <= inside.any((1, 3))).all()
+            assert (
+                np.abs(file.read()[:, shown].astype(int) - 180).max() <= 20
+            )  # JPEG beside black, which a mean with it would be 45 darker by
 
 
 def test_overviews_never_invent_a_code(tmp_path):

@@ -283,6 +283,37 @@ def seam_step(rgb):
     return right / left - 1
 
 
+@pytest.mark.parametrize("count", [1, 2, 7, 300])
+def test_shares_of_all_images_add_up(count):
+    rng = np.random.default_rng(count)
+    costs = rng.uniform(0, 0.1, (count, 128, 128)).astype(np.float32)
+    costs[rng.random(costs.shape) < 0.4] = np.inf
+    costs[:, :20, :30] = np.inf
+    lowest, first = mosaic._lowest(list(costs))
+    seen = np.isfinite(lowest)
+    shares = list(mosaic._shares(list(costs), np.where(seen, lowest, np.float32(0)), first, seen, 0.02))
+    assert {share.dtype for share in shares} == {np.dtype(np.uint8)}
+    assert (np.sum(shares, axis=0, dtype=int) == np.where(seen, 255, 0)).all()
+    assert all((share[np.isinf(cost)] == 0).all() for share, cost in zip(shares, costs, strict=True))
+
+
+@pytest.mark.parametrize("ground_cell_m", [0.02, 0.024, 0.05, 0.006])  # nodes 2, 4, 8 and 1 cells apart
+def test_images_are_looked_at_only_where_they_count(ground_cell_m):
+    views = two_views(rolling)
+    made = plan_of(TILE, terrain_of(rolling, cell_m=ground_cell_m), views)
+    whole = (slice(0, nodes.BLOCK), slice(0, nodes.BLOCK))
+
+    def unfolded(patch):
+        weight = np.zeros((nodes.BLOCK, nodes.BLOCK), np.uint8)
+        weight[patch.part] = 255 if patch.weight is None else patch.weight
+        return patch._replace(part=whole, weight=weight)
+
+    laid = [one._replace(patches=[unfolded(patch) for patch in one.patches]) for one in made.laid]
+    assert any(patch.part != whole for one in made.laid for patch in one.patches)
+    parts, wholes = seabed.compose([made, made._replace(laid=tuple(laid))], views)
+    np.testing.assert_array_equal(parts.rgb, wholes.rgb)
+
+
 def test_what_is_left_of_the_lighting_makes_no_seam():
     left, right = two_views()
     left, right = (view._replace(image=np.full_like(view.image, level)) for view, level in ((left, 100), (right, 120)))
