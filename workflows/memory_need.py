@@ -19,7 +19,7 @@ _EACH_PIXEL: Final = 20  # of an image while it is measured, bytes
 _EACH_DECODED: Final = 15  # while 16 bits a channel are decoded
 _EACH_ADJUSTED: Final = 600_000  # of an image in the adjustment, bytes
 _EACH_CELL: Final = 200  # of a tile of the bathymetry with what surrounds it
-_EACH_TEXEL: Final = 45  # of a tile of the mosaic
+_EACH_TEXEL: Final = 30  # of a tile of the mosaic
 _BESIDES: Final = 0.1 * GIB
 
 
