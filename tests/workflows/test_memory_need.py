@@ -32,7 +32,7 @@ def test_a_plan_that_cannot_fit_is_refused_before_it_starts(tiny_mission, tmp_pa
         run(str(tiny_mission), tmp_path / "out", large, scheduler="threads", workers=2)
     (problem,) = refused.value.problems
     assert problem.key == "mosaic.tile_cells"
-    assert problem.found == "a tile of the mosaic (8192 x 8192) needs 3.2 GiB"
+    assert problem.found == "a tile of the mosaic (8192 x 8192) needs 2.2 GiB"
     assert problem.expected == "at most the 2.0 GiB of a worker"
     assert "Make mosaic.tile_cells smaller, or give a worker more memory" in problem.remedy
     assert not list((tmp_path / "out").rglob("*.npz"))
