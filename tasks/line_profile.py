@@ -242,12 +242,12 @@ def _typical_width(image: NDArray[np.uint8], v: Indices, centre: Indices, box_px
     ends = max(1, half // 4)
     ground = 0.5 * (light[:, :ends].mean(axis=1) + light[:, -ends:].mean(axis=1))
     profile = np.sort((light - ground[:, None]).T, axis=1)[:, len(light) // 2].astype(float)
-    x = np.arange(-half, half + 1)
-    sigma = half / 3
+    x, profile = np.arange(-half, half + 1), np.maximum(profile, 0)
+    square, sigma = x**2, half / 3
     for _ in range(12):
         before, wide = sigma, 1.5 * sigma
-        weight = np.maximum(profile, 0) * np.exp(-0.5 * (x / wide) ** 2)
-        spread = float((weight * x**2).sum() / max(weight.sum(), 1e-12))
+        weight = profile * np.exp(-0.5 * (x / wide) ** 2)
+        spread = float((weight @ square) / max(weight.sum(), 1e-12))
         # the weight narrows a Gaussian profile: 1/spread = 1/sigma^2 + 1/wide^2
         sigma = float(np.sqrt(1 / max(1 / max(spread, 0.05) - 1 / wide**2, (1.5 / half) ** 2)))
         if abs(sigma - before) < 0.01 * sigma:

@@ -11,7 +11,7 @@ from . import cross, laser, line_profile, sheet_search
 from .camera import normalised, project, rays
 from .laser_colour import without_grey_channels
 from .medians import median
-from .sheet_grid import on_sheets
+from .sheet_grid import OnSheets, on_sheets
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,9 @@ def intersect(camera: Camera, sheet: LaserPlane, uv: Array) -> tuple[Array, Arra
     return origin + distance[:, None] * direction, np.where(np.isfinite(distance), distance, np.inf)
 
 
-def triangulate(camera: Camera, light: Laser, uv: Array, arm: NDArray, sigma_px: Array) -> Soundings:
+def triangulate(
+    camera: Camera, light: Laser, uv: Array, arm: NDArray, sigma_px: Array, seen: OnSheets | None = None
+) -> Soundings:
     """Soundings of points whose arm is known (paper III.D).
 
     The uncertainty of the column is carried along the ray by the distance's change over one pixel.
@@ -71,10 +73,11 @@ def triangulate(camera: Camera, light: Laser, uv: Array, arm: NDArray, sigma_px:
     uv : (N, 2) pixels
     arm : (N,) index into light.sheets
     sigma_px : (N,) 1-sigma of u, pixels
+    seen : what the pixels see on either sheet, where it is known
     """
     uv = np.asarray(uv, float).reshape(-1, 2)
     X, sigma = np.full((len(uv), 3), np.nan), np.full(len(uv), np.nan)
-    change = on_sheets(camera, light, *uv.T).per_px
+    change = (seen or on_sheets(camera, light, *uv.T)).per_px
     for number, sheet in enumerate(light.sheets):
         own = np.flatnonzero(np.asarray(arm) == number)
         X[own], distance = intersect(camera, sheet, uv[own])
@@ -203,11 +206,11 @@ def on_both_sheets(image_bgr: NDArray[np.uint8], camera: Camera, light: Laser, p
     line = line_profile.measure(image, arms, small.factor, parameters.gamma)
     if len(line.uv) < parameters.min_soundings:
         return Sounded(no_soundings(), line, small, "no laser found")
-    soundings = triangulate(camera, light, line.uv, line.arm, line.sigma_px)
-    keep = _apart(camera, light, line) & reject_outliers(soundings, parameters)
-    count = int(np.count_nonzero(keep))
-    if count < parameters.min_soundings:
-        return Sounded(no_soundings(), line, small, _no_cross(len(keep), count))
+    seen = on_sheets(camera, light, *line.uv.T)
+    soundings = triangulate(camera, light, line.uv, line.arm, line.sigma_px, seen)
+    keep = np.flatnonzero(_apart(seen, line) & reject_outliers(soundings, parameters))
+    if len(keep) < parameters.min_soundings:
+        return Sounded(no_soundings(), line, small, _no_cross(len(line.uv), len(keep)))
     return Sounded(soundings.take(keep), line, small, "")
 
 
@@ -227,10 +230,8 @@ def _sound_sheets(
     return ImageSoundings(soundings, np.concatenate([whole, glow]), reach, reason, agreement(soundings))
 
 
-def _apart(camera: Camera, light: Laser, line: line_profile.Line) -> NDArray[np.bool_]:
+def _apart(seen: OnSheets, line: line_profile.Line) -> NDArray[np.bool_]:
     """Which points (N,) are clear of the crossing: on a level bottom the other arm is far from them in their row."""
-    u, v = line.uv.T
-    seen = on_sheets(camera, light, u, v)
     first, second = seen.inverse_depth
     per_px = 0.5 * (np.abs(first * seen.per_px[0]) + np.abs(second * seen.per_px[1]))
     return np.abs(first - second) > line_profile.APART * line.width_px * per_px
