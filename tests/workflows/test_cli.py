@@ -96,7 +96,13 @@ def test_a_cluster_file_and_a_scheduler_are_one_too_many(tiny_mission, monkeypat
 @pytest.mark.parametrize(("how", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_run_that_is_stopped_says_so(reef, tmp_path, how, code):
     command = [sys.executable, "-m", "seamosaic.workflows.cli", "run", str(reef.mission), "-o", str(tmp_path)]
-    process = subprocess.Popen([*command, "--workers", "1"], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*command, "--workers", "1"],
+        stderr=subprocess.PIPE,
+        text=True,
+        # a shell's background jobs ignore it, and so does what they start
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     while not list(tmp_path.rglob("*.npz")):
         assert process.poll() is None
         time.sleep(0.02)
