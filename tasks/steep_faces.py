@@ -14,9 +14,9 @@ from scipy import sparse
 
 from . import occlusion
 from .grids import Grid
-from .mosaic import Tone
 from .nodes import BEST, Lie, Shot, quality_scale
 from .projection import departure, pixels
+from .seams import Tone
 from .terrain import Terrain
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from ..tasks import grids, mesh, mosaic, nodes, steep_faces, terrain
+from ..tasks import grids, mesh, mosaic, nodes, painting, steep_faces, terrain
 from ..tasks.grids import Grid
 from ..tasks.navigation import Poses
 from . import mosaics, solve
@@ -207,7 +207,7 @@ def _fill(rgb: np.ndarray, mask: np.ndarray) -> None:
     share = cv2.resize(mask.astype(np.float32), small, interpolation=cv2.INTER_AREA)
     known = cv2.resize(rgb, small, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-3)[..., None]
     known = np.clip(np.rint(known), 0, 255).astype(np.uint8)
-    filled = mosaic.paint_over(known, share < 0.5)
+    filled = painting.paint_over(known, share < 0.5)
     wide = cv2.resize(filled, mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
     cv2.copyTo(wide, (~mask).astype(np.uint8), rgb)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..catalog.store import Store
 from ..schemas.calibration import Camera
-from ..tasks import camera, colour, frames, laser, mosaic, nodes, planar, terrain, water
+from ..tasks import camera, colour, frames, laser, mosaic, nodes, planar, seams, terrain, water
 from ..tasks.frames import MapFrame
 from ..tasks.grids import Grid
 from ..tasks.navigation import Poses
@@ -118,7 +118,7 @@ def mosaic_tile(m: MapJob, tile: Tile, ground: Sequence[tuple[Grid, Done]], alig
         toned = tone(m.job.calibration.camera, model) if model else None
         both = _on_surface(m, tile, ground, solution.poses), _on_plane(m, tile, aligned, solution.poses)
         plans = [
-            mosaic.plan(tile.grid, place, [(one, lies[one.number]) for one in shots], toned) for place, lies in both
+            seams.plan(tile.grid, place, [(one, lies[one.number]) for one in shots], toned) for place, lies in both
         ]
         images = {image.row: image for image in tile.images}
 
@@ -219,7 +219,7 @@ def read_image(job: Job, image: Image, times: int) -> np.ndarray:
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
 
 
-def tone(lens: Camera, model: water.Water) -> mosaic.Tone:
+def tone(lens: Camera, model: water.Water) -> seams.Tone:
     """What an image's light is multiplied with, less what, by pixel and distance."""
 
     def at(u: np.ndarray, v: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -155,9 +155,8 @@ def test_overviews_of_a_picture_keep_its_colours_at_a_rim(tmp_path):
             inside = seen.reshape(1500 // factor, factor, 1100 // factor, factor)
             assert (shown >= inside.all((1, 3))).all()
             assert (shown <= inside.any((1, 3))).all()
-            assert (
-                np.abs(file.read()[:, shown].astype(int) - 180).max() <= 20
-            )  # JPEG beside black, which a mean with it would be 45 darker by
+            # JPEG beside black; a mean with black would be 45 darker
+            assert np.abs(file.read()[:, shown].astype(int) - 180).max() <= 20
 
 
 def test_overviews_never_invent_a_code(tmp_path):

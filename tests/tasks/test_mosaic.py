@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from seamosaic.tasks import grids, mosaic, nodes
+from seamosaic.tasks import grids, mosaic, nodes, painting, seams
 from seamosaic.tasks.frames import LocalAffine, MapFrame
 from seamosaic.tasks.grids import Grid
 from seamosaic.tasks.terrain import Terrain
@@ -30,7 +30,7 @@ def terrain_of(height, tile=TILE, halo_m=0.5, cell_m=0.02, local=SAME):
 
 def plan_of(tile, terrain, views, feather_m=0.02, **options):
     shots = [(seabed.shot_of(view), nodes.lie(terrain.local, *view[3:5])) for view in views]
-    return mosaic.plan(tile, nodes.ground(tile, terrain), shots, feather_m=feather_m, **options)
+    return seams.plan(tile, nodes.ground(tile, terrain), shots, feather_m=feather_m, **options)
 
 
 def compose(tile, terrain, views, feather_m=0.02):
@@ -244,11 +244,11 @@ def test_paint_over_fills_from_around():
     erase[:, 180:200] = True
     erase[140:160] = True
     spoilt = np.where(erase[..., None], np.uint8(255), ramp)
-    painted = mosaic.paint_over(spoilt, erase)
+    painted = painting.paint_over(spoilt, erase)
     error = np.abs(painted.astype(int) - ramp)
     assert (error[~erase] == 0).all()
     assert 0 < error.max() < 20
-    assert mosaic.paint_over(spoilt, np.zeros_like(erase)) is spoilt
+    assert painting.paint_over(spoilt, np.zeros_like(erase)) is spoilt
 
 
 def test_images_that_count_nowhere_are_not_read():
@@ -289,9 +289,9 @@ def test_shares_of_all_images_add_up(count):
     costs = rng.uniform(0, 0.1, (count, 128, 128)).astype(np.float32)
     costs[rng.random(costs.shape) < 0.4] = np.inf
     costs[:, :20, :30] = np.inf
-    lowest, first = mosaic._lowest(list(costs))
+    lowest, first = seams._lowest(list(costs))
     seen = np.isfinite(lowest)
-    shares = list(mosaic._shares(list(costs), np.where(seen, lowest, np.float32(0)), first, seen, 0.02))
+    shares = list(seams._shares(list(costs), np.where(seen, lowest, np.float32(0)), first, seen, 0.02))
     assert {share.dtype for share in shares} == {np.dtype(np.uint8)}
     assert (np.sum(shares, axis=0, dtype=int) == np.where(seen, 255, 0)).all()
     assert all((share[np.isinf(cost)] == 0).all() for share, cost in zip(shares, costs, strict=True))
@@ -325,7 +325,7 @@ def test_what_is_left_of_the_lighting_makes_no_seam():
             (seabed.shot_of(view, small), nodes.lie(terrain.local, *view[3:5]))
             for view, small in zip((left, right), thumbnails, strict=True)
         ]
-        made = mosaic.plan(TILE, nodes.ground(TILE, terrain), shots, plain_tone)
+        made = seams.plan(TILE, nodes.ground(TILE, terrain), shots, plain_tone)
         results.append(seabed.compose([made], [left, right])[0].rgb)
     assert seam_step(results[0]) > 0.15
     assert 0.01 < seam_step(results[1]) < 0.08  # spread over decimetres

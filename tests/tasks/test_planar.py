@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from seamosaic.tasks import grids, mosaic, nodes, planar
+from seamosaic.tasks import grids, nodes, planar, seams
 from seamosaic.tasks.grids import Grid
 
 from tests.tasks import seabed
@@ -79,7 +79,7 @@ def mosaic_of(views, similarities):
     shots = [
         (seabed.shot_of(view), planar.lie(view.R_local_camera, M)) for view, M in zip(views, similarities, strict=True)
     ]
-    return seabed.compose([mosaic.plan(TILE, nodes.flat_ground(TILE), shots)], views)[0]
+    return seabed.compose([seams.plan(TILE, nodes.flat_ground(TILE), shots)], views)[0]
 
 
 def test_flat_ground_comes_back_in_its_place():

@@ -100,7 +100,7 @@ def test_a_run_that_is_stopped_says_so(reef, tmp_path, how, code):
         [*command, "--workers", "1"],
         stderr=subprocess.PIPE,
         text=True,
-        # a shell's background jobs ignore it, and so does what they start
+        # a shell's background jobs ignore SIGINT, and so does what they start
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     while not list(tmp_path.rglob("*.npz")):
