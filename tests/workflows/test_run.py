@@ -21,12 +21,13 @@ import xarray
 import yaml
 from rio_cogeo import cog_validate
 from seamosaic.catalog import memory, trajectories
+from seamosaic.catalog.missions import open_mission
 from seamosaic.schemas.parameters import Parameters
 from seamosaic.schemas.problems import InvalidInput
 from seamosaic.schemas.products import PRODUCTS
 from seamosaic.tasks import derivatives, grids
 from seamosaic.tasks.camera import ground_sample_distance
-from seamosaic.workflows import maps, mesh_products, products
+from seamosaic.workflows import maps, mesh_products, plan, products
 from seamosaic.workflows.calibrate_inputs import read_calibration
 from seamosaic.workflows.evaluate import evaluate
 from seamosaic.workflows.mapping import NothingToMap
@@ -206,6 +207,25 @@ def test_another_cell_size_makes_the_bathymetry_only(reef, tmp_path, monkeypatch
     assert {"mosaic.tif", "mosaic-planar.tif", "mesh.glb", "mesh-3dtiles/tileset.json", "soundings.laz"} <= shared
     assert "bathymetry.tif" not in shared
     assert result.quality.mesh == reef.result.quality.mesh
+
+
+def test_another_image_makes_only_what_depends_on_it(reef, tmp_path):
+    """Another file with the same pixels: its extraction, its pairs and the adjustment; poses are what they were."""
+    mission, out = tmp_path / "mission", tmp_path / "out"
+    shutil.copytree(reef.mission, mission)
+    shutil.copytree(reef.out, out)
+    opened = open_mission(str(mission))
+    wanted = plan.first_pairs(plan.plan(opened, Parameters()), opened, Parameters())
+    image = mission / str(opened.frames["image"].values[0])
+    image.write_bytes(image.read_bytes() + bytes(8))
+    result = run(str(mission), out, Parameters(), scheduler="sync")
+    computed, total = _computed(result), {step.name: step.count_total for step in result.steps}
+    assert (computed["extract"], computed["adjust"]) == (1, 1)
+    assert computed["match"] == sum(0 in pair.rows for pair in wanted) < total["match"] == len(wanted)
+    assert 0 < computed["ties"] <= computed["match"] < total["ties"]
+    assert 0 < computed["dense"] <= computed["match"] < total["dense"]
+    assert result.path.name == "v2"
+    assert differing(reef.result.path, result.path) == ["metadata/provenance.json"]
 
 
 def test_what_the_calibration_leaves_open_is_in_every_sigma(reef, tmp_path):
